@@ -11,15 +11,14 @@ import signal
 import sys
 import warnings
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
-from functools import partial
 from importlib import import_module
 from itertools import pairwise
 from typing import Any, ClassVar, Final, NoReturn
 
 import typer
-from typer.core import TyperArgument, TyperCommand, TyperGroup, TyperOption
+from typer.core import TyperCommand, TyperGroup, TyperOption
 
 from railfix.core.errors import InputFileError, OutputError, RailfixError, RailfixWarning, SettingsError
 from railfix.core.extras import needs_extra
@@ -36,11 +35,6 @@ _FULL: Final = (errno.ENOSPC, errno.EIO, errno.EFBIG, errno.EDQUOT)
 
 class Command(TyperCommand):
     """Command that rejects repeated options and values after switches, and reports all missing options together."""
-
-    def __init__(self, *args: Any, **options: Any) -> None:
-        super().__init__(*args, **options)
-        for param in self.params:
-            _simplify_help(param)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse the arguments; a repeated option, a value after a switch, or a missing option is a usage error."""
@@ -77,40 +71,6 @@ class Command(TyperCommand):
         for before, after in pairwise(args):
             if before == name and after.lower() in _YES_NO:
                 ctx.fail(f"{name} is a switch and takes no value; remove {after} after it")
-
-
-#: Maximum number of characters in a line of choices on a help page; on a terminal of 80 columns, typer would break
-#: words in longer lines.
-_CHOICES_WIDTH: Final = 20
-
-
-def _simplify_help(param: Any) -> None:
-    """Change the help of a parameter: no Python type for an argument or a switch, several lines for a long list of
-    choices.
-    """
-    show = getattr(param, "display_type_rich", None)  # typer before 0.29 shows no types
-    if show is None:
-        return
-    if isinstance(param, TyperArgument):
-        name = param.metavar or str(param.name).upper()
-        param.get_usage_pieces = lambda ctx: [name if param.required else f"[{name}]"]  # type: ignore[method-assign]  # noqa: ARG005
-    hidden = isinstance(param, TyperArgument) or getattr(param, "is_flag", False)
-    param.display_type_rich = (lambda **_: None) if hidden else partial(_wrap_choices, show)
-
-
-def _wrap_choices(show: Callable[..., str | None], **context: Any) -> str | None:
-    """Return the type of an option for the help; choices are wrapped at their bars to at most `_CHOICES_WIDTH`
-    characters.
-    """
-    text = show(**context)
-    if text is None or "|" not in text:
-        return text
-    lines = [""]
-    for choice in re.findall(r"[^|]+\|?", text):
-        if lines[-1] and len(lines[-1]) + len(choice) > _CHOICES_WIDTH:
-            lines.append("")
-        lines[-1] += choice
-    return "\n".join(lines)
 
 
 class Commands(TyperGroup):

@@ -48,9 +48,10 @@ def find_table_kind(path: Path) -> TableKind | Literal["other"] | None:
 
     The kind is "other" if railfix reads no table with these columns.
     """
-    if find_kind(path) == "mate":
+    kind = find_kind(path)
+    if kind == "mate":
         return _OF_MATE.get(mate_table(path))
-    if find_kind(path) == "parquet":
+    if kind == "parquet":
         with reading_table(path):
             columns = tuple(pl.read_parquet_schema(path))
     else:
@@ -65,7 +66,7 @@ def find_table_kind(path: Path) -> TableKind | Literal["other"] | None:
         return "heights"
     # results and ground truth have these columns
     found = None if names & {"antenna", "read"} else find_sensor_table(columns)
-    return next((kind for kind in TABLE_KINDS if kind == found), "other")
+    return next((table for table in TABLE_KINDS if table == found), "other")
 
 
 def read_table_facts(path: Path, kind: TableKind) -> tuple[str, Span | None]:
