@@ -73,7 +73,7 @@ def test_each_table_is_known_by_its_header_and_read_as_its_command_reads_it(desk
     said = " ".join(several.problems)
     for text in (
         "has no time in common",
-        "needs also the ranging units",
+        "also needs the ranging units",
         "also the list of balises",
         "time_gpst is empty",
     ):

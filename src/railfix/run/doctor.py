@@ -398,7 +398,7 @@ def _problems(findings: Sequence[FileFinding]) -> list[str]:
     for table in (finding for finding in findings if finding.kind in TABLE_KINDS):
         other_kind = next((kind for of, kind in PAIRS.items() if of == table.kind), None)
         if logs and other_kind and not _filter(findings, other_kind) and table.kind != "list of balises":
-            problems.append(f"{table.path}: a run needs also the {other_kind.replace('_', ' ')}; give both tables")
+            problems.append(f"{table.path}: a run also needs the {other_kind.replace('_', ' ')}; give both tables")
         if (
             readable
             and table.span is not None
