@@ -74,7 +74,7 @@ def test_each_table_is_known_by_its_header_and_read_as_its_command_reads_it(desk
     for text in (
         "has no time in common",
         "also needs the ranging units",
-        "also the list of balises",
+        "also needs the list of balises",
         "time_gpst is empty",
     ):
         assert text in said
