@@ -19,20 +19,20 @@ from railfix.core.timescale import SECONDS_PER_DAY, to_week
 #: coefficients were received. The vertical delay of this model is 2.8 m RMS over time of day and latitude; the models
 #: of five other days from 2005 to 2024 differ from it by 0.7 to 1.7 m RMS.
 TYPICAL_KLOBUCHAR: Final = np.array([1.118e-8, -7.451e-9, -5.961e-8, 1.192e-7, 1.167e5, -2.294e5, -1.311e5, 1.049e6])
-#: Radius of the Earth divided by the radius of the ionosphere's thin shell, 350 km higher (DO-229D A.4.4.10.4).
+#: Earth's radius divided by the radius of a thin ionospheric shell at a height of 350 km (DO-229D A.4.4.10.4).
 _SHELL: Final = 6_378.1363 / (6_378.1363 + 350.0)
 
 
 def thin_shell_obliquity(elevation_deg: Floats) -> Floats:
-    """Return the ratio of slant to vertical delay of a thin shell (DO-229D A.4.4.10.4); NaN up to 0.1 deg elevation."""
+    """Return the slant-to-vertical delay ratio of a thin shell (DO-229D A.4.4.10.4); NaN at or below 0.1 deg."""
     cosine = np.cos(np.radians(np.where(elevation_deg > 0.1, elevation_deg, np.nan)))
     return np.asarray(1.0 / np.sqrt(1.0 - (_SHELL * cosine) ** 2))
 
 
 def vertical_delay_m(slant_m: Floats, elevation_deg: Floats, frequency_hz: Floats) -> Floats:
-    """Return the median over channels of the slant delays, mapped to the vertical on L1, shape (T,) [m]; 0 without any.
+    """Return the median vertical delay on L1 over the channels, shape (T,) [m]; 0 where no channel has a delay.
 
-    `slant_m` and `elevation_deg` have shape (T, K), the carriers `frequency_hz` shape (K,).
+    `slant_m` and `elevation_deg` have shape (T, K), the carrier frequencies shape (K,).
     """
     vertical = medians(slant_m / thin_shell_obliquity(elevation_deg) * (frequency_hz / FREQUENCY_L1) ** 2)
     return np.where(np.isfinite(vertical), vertical, 0.0)
@@ -55,8 +55,8 @@ def klobuchar_delay_m(
     """Return the ionospheric delay of the broadcast model (IS-GPS-200, 20.3.3.5.2.5, figure 20-4), shape (T, M) [m].
 
     Latitude and longitude of the receiver have shape (T,), elevation and azimuth shape (T, M). `coefficients` are alpha
-    0 to 3 and beta 0 to 3. The delay on L1 is multiplied by (f1/f)^2 for `frequency_hz`, shape (M,). The delay is NaN
-    where an input is NaN, and at or below the horizon.
+    0 to 3 and beta 0 to 3. The delay on L1 is scaled by (f1/f)^2 to the carriers `frequency_hz`, shape (M,). The delay
+    is NaN at or below the horizon, and where an input is NaN.
     """
     _, seconds_of_week = to_week(time)
     alpha, beta = np.array(coefficients, dtype=np.float64).reshape(2, 4)
@@ -73,7 +73,7 @@ def klobuchar_delay_m(
     period = np.maximum(polyval(magnetic, beta), 72_000.0)
     phase = 2.0 * np.pi * (local - 50_400.0) / period
     cosine = 1.0 + phase * phase * (-0.5 + phase * phase / 24.0)
-    # In this form of the comparison, a NaN phase results in NaN and not in the night-time delay.
+    # A NaN phase fails the comparison, so that the delay is NaN and not the night-time delay.
     delay = slant * np.where(np.abs(phase) >= 1.57, 5e-9, 5e-9 + amplitude * cosine)
     return np.asarray(SPEED_OF_LIGHT * delay * (FREQUENCY_L1 / frequency_hz) ** 2)
 
@@ -98,7 +98,7 @@ def saastamoinen_delay_m(
 
 @dataclass(frozen=True, kw_only=True)
 class SeenFrom:
-    """Directions to satellites from receiver positions accurate to hundreds of metres, T epochs by K channels."""
+    """Satellite directions from receiver positions accurate to hundreds of metres, T epochs by K channels."""
 
     receiver_ecef_m: Floats  #: Position of the receiver, shape (T, 3).
     latitude_deg: Floats  #: Geodetic latitude of the receiver, shape (T,).
@@ -126,14 +126,14 @@ class SeenFrom:
 
 @dataclass(frozen=True, kw_only=True)
 class Delays:
-    """Delays of T epochs by K channels, and the standard deviation of the residual errors."""
+    """Atmospheric delays and the sigma of their residual errors, T epochs by K channels."""
 
-    #: Delays at the channel's carrier frequency; 0 if the model is off, NaN where SBAS provides none; shape (T, K).
+    #: Ionospheric delay at the carrier frequency, shape (T, K); 0 if the model is off, NaN where SBAS has no delay.
     ionosphere_m: Floats
     troposphere_m: Floats
-    #: Standard deviation added to that of local errors; 0 with received coefficients, NaN where unknown; shape (T, K).
+    #: Sigma beyond local errors, shape (T, K); 0 with received Klobuchar coefficients, NaN where unknown.
     sigma_m: Floats
-    reason: Bits  #: Rejection reasons due to unknown delays (`Reason` bits), shape (T, K).
+    reason: Bits  #: Rejection reasons (`Reason` bits) where a delay is unknown, shape (T, K).
 
 
 def model_delays(
@@ -145,7 +145,7 @@ def model_delays(
     ionosphere_sigma_m: float = 0.0,
     troposphere: str,
 ) -> Delays:
-    """Return the delays of the Klobuchar and Saastamoinen models; 0 for a model that is off (`klobuchar` None)."""
+    """Return the Klobuchar and Saastamoinen delays; the delay of a model that is off (`klobuchar` None) is 0."""
     shape = seen.elevation_deg.shape
     ionosphere, troposphere_m, sigma = np.zeros((3, *shape))
     if klobuchar is not None:

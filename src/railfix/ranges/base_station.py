@@ -18,14 +18,14 @@ from railfix.ranges.channels import Channels
 from railfix.ranges.sources import BaseDifferences, CorrectionSource, SourceDelays, SourceSatellites
 
 Values = TypeVar("Values", Floats, Integers)
-#: Largest time by which an epoch of the station may be later than the train's epoch, since receiver clocks differ [s].
+#: A station epoch may be later than the train's epoch by this time [s], because the two receiver clocks differ.
 _SAME_S: Final = 0.05
 #: Largest age of the station's code errors [s]; without selective availability, they change by centimetres in 30 s.
 LONGEST_AGE_S: Final = 60.0
 #: Largest age of the station's phase errors [s]; they change by millimetres in a second.
 _PHASE_AGE_S: Final = 1.1
-#: Sigma per kilometre of distance between station and train, due to the differences of their ionospheric, tropospheric
-#: and orbit errors [m].
+#: Sigma of the corrected ranges per kilometre between station and train [m]; ionospheric, tropospheric and orbit errors
+#: differ between the two sites.
 _PER_KM_M: Final = 0.004
 LONGEST_KM: Final = 100.0  #: Largest distance at which the station is used [km].
 
@@ -41,26 +41,26 @@ class BaseLimits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class BaseErrors:
-    """Range errors of a base station by channel, B epochs by S channels."""
+    """Range errors measured by a base station, B epochs by S channels."""
 
     ecef_m: Floats  #: Position of the station, shape (3,).
     time: Datetimes  #: Time tags of the station, shape (B,).
     #: Satellite and signal of each channel, shape (S,).
     satellite: Strings
     signal: Strings
-    #: Corrected code minus geometric range, and minus the receiver clock offset of the constellation; NaN where not
-    #: observed; shape (B, S).
+    #: Corrected code minus geometric range and minus the constellation's receiver clock offset, shape (B, S). It is NaN
+    #: where no code was observed.
     code_m: Floats
-    #: Corrected phase minus geometric range, and minus a clock offset common to all channels; the ambiguity remains;
-    #: shape (B, S).
+    #: Corrected phase minus geometric range and minus a clock offset common to all channels, shape (B, S). The
+    #: ambiguity remains.
     phase_m: Floats
-    arc: Integers  #: Number of the arc of each phase, shape (B, S).
+    arc: Integers  #: Carrier-phase arc number, shape (B, S).
 
     def __len__(self) -> int:
         return len(self.time)
 
     def merge(self, later: BaseErrors) -> BaseErrors:
-        """Return these errors followed by later errors, with the channels of both."""
+        """Return these errors followed by `later`, for every channel that occurs in either."""
         parts = (self, later)
         keys = sorted({key for part in parts for key in part.keys})
         return replace(
@@ -79,7 +79,7 @@ class BaseErrors:
         return list(zip(self.satellite.tolist(), self.signal.tolist(), strict=True))
 
     def drop_before(self, time: np.datetime64) -> BaseErrors:
-        """Return the errors from `time` on, for channels with a code error at any of these epochs."""
+        """Drop the epochs before `time`, and channels without a code error at the remaining epochs."""
         rows = self.time >= time
         seen = np.isfinite(self.code_m[rows]).any(axis=0)
         return replace(
@@ -93,13 +93,13 @@ class BaseErrors:
     def at(
         self, time: Datetimes, satellite: Strings, signal: Strings, receiver_ecef_m: Floats, limits: BaseLimits
     ) -> BaseDifferences:
-        """Return the station's newest errors at a train's epochs (T,), for the train's channels (K,).
+        """Return the station's newest errors for the train's T epochs and K channels.
 
         `receiver_ecef_m` are approximate positions of the train, shape (T, 3).
 
-        For a channel that the station does not observe, another signal of the same band is used; the two signals differ
-        by a constant per constellation. Where the station has no recent error, or is farther away than `LONGEST_KM`,
-        the errors are NaN and the arcs -1.
+        For a channel that the station does not observe, another signal of the same band is used; the two signals are
+        assumed to differ by a constant per constellation. Where the station has no recent error, or is farther away
+        than `LONGEST_KM`, the errors are NaN and the arcs -1.
         """
         shape = (len(time), len(satellite))
         of_band = {(name, code[:1]): k for k, (name, code) in enumerate(self.keys)}
@@ -138,10 +138,10 @@ def _on(values: Values, own: Sequence[tuple[str, str]], keys: Sequence[tuple[str
 class BaseStationSource:
     """Correction source that adds the range errors measured by a base station to the corrections of another source."""
 
-    other: CorrectionSource  #: Source of satellites and delays.
+    other: CorrectionSource  #: Source of satellite positions, clocks and delays.
     errors: BaseErrors
     limits: BaseLimits
-    floor_sigma_m: float  #: Error floor of codes that the station does not correct (`CodeNoise`) [m].
+    floor_sigma_m: float  #: Error floor (`CodeNoise`) of code ranges without a station correction [m].
     second: Literal["none", "optional", "required"] = "none"
 
     @property

@@ -15,7 +15,7 @@ from railfix.core.constants import CLOCK_GROUP
 from railfix.core.reasons import Reason
 from railfix.gnss.observations import carrier_frequency_hz
 
-#: Limits of plausible pseudoranges [m]; they contain those of all satellites at receiver clock offsets up to 33 ms.
+#: Limits of plausible pseudoranges [m], wide enough for receiver clock offsets up to 33 ms.
 PLAUSIBLE_CODE_M: Final = (1e7, 1e8)
 
 
@@ -46,18 +46,18 @@ DFMC_SIGNALS: Final[Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]]] = {
 
 #: Signals with ten times the chip rate of L1 C/A, by constellation and band.
 _FAST: Final = ("G5", "J5", "E5", "E7", "C5", "C6")
-#: Noise and multipath of the signals in `_FAST` relative to L1 at the same C/N0; measured values are 0.4 on a phone (L5
-#: to L1) and 0.8 on an F9P (E5b to E1).
+#: Ratio of their noise and multipath to L1 C/A at the same C/N0. Measured ratios are 0.4 on a phone (L5 to L1) and 0.8
+#: on an F9P (E5b to E1).
 _FAST_NOISE: Final = 0.5
 
 
 def relative_noise(signal: str) -> float:
-    """Return the noise and the multipath of a signal ("G5Q") relative to L1 C/A at the same C/N0."""
+    """Return the ratio of a signal's ("G5Q") noise and multipath to L1 C/A at the same C/N0."""
     return _FAST_NOISE if signal[:2] in _FAST else 1.0
 
 
 def clock_groups(system: Sequence[str] | Strings) -> tuple[slice, ...]:
-    """Return slices of channels that share a receiver clock; raise ValueError if those of a clock are not adjacent."""
+    """Return one slice per receiver clock; raise ValueError if the channels of a clock are not adjacent."""
     clocks = [CLOCK_GROUP[str(letter)] for letter in system]
     starts = [i for i, clock in enumerate(clocks) if i == 0 or clock != clocks[i - 1]]
     if len({clocks[i] for i in starts}) != len(starts):
@@ -79,7 +79,7 @@ def channel_order(
 
 
 def first_available(satellite: Strings, available: Masks) -> Masks:
-    """Return a mask (T, K) of the first available channel of each satellite at each epoch, in channel order."""
+    """Return a mask (T, K) of each satellite's first available channel at each epoch."""
     starts = np.flatnonzero(np.append(True, satellite[1:] != satellite[:-1])) if len(satellite) else np.empty(0, int)
     if len(starts) == len(satellite):
         return available.copy()
@@ -91,29 +91,29 @@ def first_available(satellite: Strings, available: Masks) -> Masks:
 
 @dataclass(frozen=True, kw_only=True)
 class Channels:
-    """M channels of a log, and the K channels among them that the settings allow."""
+    """The M channels of a log, and the K channels selected by the settings."""
 
-    #: Columns of the K channels in the observations, shape (K,). Channels of one clock are adjacent. Of each satellite,
-    #: the preferred signal is first.
+    #: Columns of the selected channels in the observations, shape (K,). Channels of a receiver clock are adjacent. The
+    #: channels of a satellite are in order of preference.
     columns: Indices
-    #: Satellite and signal of each of the K channels, shape (K,).
+    #: Satellite and signal of each selected channel, shape (K,).
     satellite: Strings
     signal: Strings
-    groups: tuple[slice, ...]  #: Slice of the K channels for each receiver clock.
+    groups: tuple[slice, ...]  #: Slice of the selected channels for each receiver clock.
     clocks: tuple[str, ...]  #: Letter of each receiver clock (`CLOCK_GROUP`).
     clock: Strings  #: Letter of the receiver clock of each channel, shape (K,).
-    frequency_hz: Floats  #: Carrier frequency of the K channels, shape (K,).
+    frequency_hz: Floats  #: Carrier frequency of the selected channels, shape (K,).
     every_frequency_hz: Floats  #: Carrier frequency of all channels of the log, shape (M,).
-    left_out: Integers  #: Reason why the settings leave a channel out, 0 for channels in use; shape (M,).
+    left_out: Integers  #: Reason why a channel is not selected, shape (M,); 0 for selected channels.
     member: Integers  #: 1 where a channel belongs to one of the S satellites, else 0; shape (M, S).
-    #: Columns of the second signals of each channel's satellite in order of preference, -1 for none; shape (K, P). P is
-    #: 0 with one frequency. With two frequencies it is at least 1, even if the log has no second signal.
+    #: Columns of the second signals of each channel's satellite in order of preference, shape (K, P); -1 for none. P is
+    #: 0 if no second signals are wanted, else at least 1.
     second: Indices
-    second_signal: Strings  #: Second signals with the letter of the constellation, shape (K, P).
+    second_signal: Strings  #: Second signals with constellation letter ("G5Q"), shape (K, P).
     second_ratio: Floats  #: Squared ratio of the first to the second frequency, shape (K, P).
     second_noise: Floats  #: Noise of the second signals relative to L1 C/A, shape (K, P).
     pair_names: tuple[str, ...]  #: Satellite and both signals of each pair of codes, length K * P.
-    pair_groups: Integers  #: Group of each pair; the pairs of a group have a common receiver delay; shape (K * P,).
+    pair_groups: Integers  #: Group of each pair, shape (K * P,). The pairs of a group share a receiver delay.
 
     @cached_property
     def names(self) -> Strings:
@@ -141,7 +141,7 @@ def select_channels(
     Parameters
     ----------
     satellite, signal : ndarray of str, shape (M,)
-        Channels of the log, signals as RINEX 3 codes without the type letter ("1C").
+        Channels of the log. Signals are RINEX 3 codes without the type letter ("1C").
     systems : sequence of str
         Letters of the constellations: G GPS, J QZSS, E Galileo, C BeiDou, R GLONASS.
     signals : mapping of str to sequence of str

@@ -27,12 +27,11 @@ if TYPE_CHECKING:
 __all__ = ["KINDS", "Cn0Curve", "Cn0CurveSource", "Cn0Mean", "SourceFile", "satellite_kind"]
 
 
-#: Numbers of BeiDou satellites at a height of 36 000 km (GEO: C01-C05 and C59-C63; IGSO: according to CSNO,
-#: constellation status).
+#: Numbers of BeiDou GEO (C01-C05, C59-C63) and IGSO satellites, at a height of 36 000 km (CSNO, constellation status).
 _BEIDOU_HIGH: Final = frozenset({*range(1, 11), 13, 16, 31, 38, 39, 40, 56, *range(59, 64)})
 _QZSS_GEO: Final = frozenset({7, 8})  #: Numbers of the geostationary QZSS satellites (IS-QZSS-PNT: PRN 199, 200).
 
-#: Kinds of satellites, and the name of each kind; the satellites of a kind have equal transmit power.
+#: Satellite kinds and their names. The satellites of a kind are assumed to transmit with equal power.
 KINDS: Final[dict[str, str]] = {
     "G": "GPS",
     "J": "QZSS",
@@ -139,7 +138,7 @@ class Cn0Curve:
         return np.array([mean is not None for mean in self._find(satellite, signal)], dtype=bool)
 
     def mean_dbhz(self, elevation_deg: ArrayLike, *, satellite: Strings, signal: Strings) -> Floats:
-        """Return the mean C/N0 of channels at their elevations, shape (T, M) [dB-Hz]; NaN without a curve."""
+        """Return the mean C/N0 at each channel's elevation, shape (T, M) [dB-Hz]; NaN for channels without a curve."""
         elevation = np.asarray(elevation_deg, dtype=np.float64)
         result = np.full(elevation.shape, np.nan)
         columns: dict[tuple[str, str], list[int]] = defaultdict(list)
@@ -151,7 +150,7 @@ class Cn0Curve:
         return result
 
     def notes_for(self, header: ObservationHeader) -> tuple[str, ...]:
-        """Return one sentence for each difference of antenna or receiver between the log of the curve and `header`."""
+        """Return notes on an antenna or a receiver that differs between the curve's log and `header`."""
         notes = []
         for what in ("antenna", "receiver"):
             ours, theirs = _plain(getattr(self.source, what)), _plain(getattr(header, what))

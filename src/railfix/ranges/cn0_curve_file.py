@@ -16,7 +16,7 @@ from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0CurveSource, Cn0Mean
 __all__ = ["FORMAT", "read_cn0_curve", "write_cn0_curve"]
 
 FORMAT: Final = "railfix C/N0 curve 1"
-#: Columns of a curve, and the number of decimals that are written.
+#: Number of decimals written for each column of a curve.
 _DIGITS: Final = {"elevation_deg": 3, "mean_dbhz": 2, "spread_db": 2, "count": 0}
 
 

@@ -27,8 +27,7 @@ class CurveFit(Settings):
     #: Minimum number of samples of a bin; a bin with fewer samples is left out.
     least_samples: int = Field(default=30, ge=1)
     least_bins: int = Field(default=4, ge=2)  #: Minimum number of bins of a curve; no curve is fitted to fewer bins.
-    #: Largest distance of a sample from the median of the bin, in robust standard deviations; other samples are left
-    #: out.
+    #: Samples farther from their bin's median than this many robust standard deviations are excluded as outliers.
     clip_sigma: float = Field(default=3.0, gt=0.0)
 
 
@@ -64,10 +63,10 @@ def fit_cn0_curve(
     fit: CurveFit | None = None,
     source: Cn0CurveSource | None = None,
 ) -> Cn0Curve:
-    """Fit the mean C/N0 over elevation, one curve per kind of satellites and signal with enough bins.
+    """Fit a curve of mean C/N0 over elevation for each kind and signal that has enough bins.
 
     `samples` is a `Cn0Samples` of an antenna under open sky, or an iterable of tuples of C/N0 (T, M), elevation (T, M),
-    satellite (M,) and signal (M,). Raises ValueError if no kind and signal has enough samples.
+    satellite (M,) and signal (M,). Raises ValueError if there are too few samples for any curve.
     """
     fit = fit or CurveFit()
     if not isinstance(samples, Cn0Samples):
@@ -85,7 +84,7 @@ def fit_cn0_curve(
 
 
 def _fit_mean(key: tuple[str, str], elevation: Floats, cn0: Floats, fit: CurveFit) -> Cn0Mean | None:
-    """Return the curve of one kind of satellites and one signal; None with too few bins."""
+    """Return the curve of one kind of satellites and one signal; None if it has too few bins."""
     which = np.minimum(elevation // fit.bin_deg, np.ceil(90.0 / fit.bin_deg) - 1.0).astype(np.int64)
     bins = [b for b in np.unique(which).tolist() if np.count_nonzero(which == b) >= fit.least_samples]
     if len(bins) < fit.least_bins:

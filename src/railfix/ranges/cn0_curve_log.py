@@ -22,14 +22,13 @@ from railfix.io.logs import read_navigation, scan_observations
 from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0CurveSource, SourceFile
 from railfix.ranges.cn0_curve_fit import Cn0Samples, CurveFit, fit_cn0_curve
 
-_SHORT_S: Final = 12 * 3600.0  #: Duration below which a log causes a note [s]; P1 2.3(1) requires about a day.
+_SHORT_S: Final = 12 * 3600.0  #: A shorter log causes a note; P1 2.3(1) requires about a day.
 _DEFICIT_DBHZ: Final = 10.0  #: P1 (table 6) rejects a signal whose C/N0 is this far below the mean [dB-Hz].
-#: Lowest elevation of the samples that are compared with the curve [deg], and largest fraction of these samples that
-#: may lie `_DEFICIT_DBHZ` below the curve without a note.
+#: A note is issued if more than this fraction of the samples above this elevation are `_DEFICIT_DBHZ` below the curve.
 _CHECKED_FROM_DEG, _REJECTED_SHARE = 15.0, 0.01
-#: A tracked satellite below this elevation indicates a wrong position of the antenna [deg].
+#: A tracked satellite below this elevation [deg] indicates a wrong antenna position.
 _BELOW_DEG: Final = -5.0
-_BELOW_SHARE: Final = 0.05  #: Largest fraction of satellites below `_BELOW_DEG` that is accepted without an error.
+_BELOW_SHARE: Final = 0.05  #: A larger fraction of satellites below `_BELOW_DEG` is an error.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,8 +41,8 @@ class Cn0Calibration:
 
 
 def satellite_elevation_deg(observations: Observations, navigation: Navigation, position_ecef_m: Floats) -> Floats:
-    """Return the elevation of satellites seen from a fixed position (3,), shape (T, M) [deg]; NaN without orbit or
-    code.
+    """Return the elevation of satellites seen from a fixed position (3,), shape (T, M) [deg]; NaN if orbit or code is
+    missing.
     """
     names, first, which = np.unique(observations.satellite, return_index=True, return_inverse=True)
     code = np.full((len(observations), len(names)), np.nan)
@@ -69,9 +68,9 @@ def cn0_curve_from_log(
 
     `position_ecef_m`, shape (3,), is the antenna position, accurate to a few kilometres; by default, the position in
     the header is used. Raises InputFileError if a file is missing or of another kind, or if the log has no epochs or no
-    C/N0; SettingsError if neither the header nor the caller gives a position; MismatchError if tracked satellites are
-    below the horizon of the position, the navigation files have no orbit for the log, or there are too few samples for
-    any curve.
+    C/N0; SettingsError if neither the header nor the caller provides a position; MismatchError if tracked satellites
+    are below the horizon of the position, the navigation files have no orbit for the log, or there are too few samples
+    for any curve.
     """
     records = read_navigation(list(navigation), broken_lines=broken_lines, date=date)
     samples, seen, below = Cn0Samples(), 0, 0

@@ -19,7 +19,7 @@ from railfix.ranges.channels import PLAUSIBLE_CODE_M, Channels, first_available
 from railfix.ranges.range_sigma import CodeNoise, code_sigma_m
 from railfix.ranges.sources import BaseDifferences, CorrectionSource, SourceSatellites
 
-#: Least and largest distance of navigation satellites from the centre of the Earth [m].
+#: Smallest and largest plausible distance of navigation satellites from the Earth's centre [m].
 ORBITS_M: Final = (2e7, 6e7)
 
 
@@ -45,7 +45,7 @@ class AntennaRanges(NotebookTable):
     #: Code corrected for satellite clock, group delay and atmosphere, and sigma of the corrected code; shape (T, K).
     corrected_code_m: Floats
     sigma_m: Floats
-    reason: Bits  #: `reasons.Reason` bits of the reasons found so far, 0 if usable; shape (T, K).
+    reason: Bits  #: Rejection reasons found so far (`reasons.Reason` bits), 0 if usable; shape (T, K).
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,10 +53,10 @@ class SecondCodes:
     """Second-frequency codes of satellites: T epochs by the K channels of the first codes."""
 
     code_m: Floats  #: Code corrected by the models; NaN where missing; shape (T, K).
-    noise_m: Floats  #: Standard deviation of noise and multipath assumed by the weights, shape (T, K).
+    noise_m: Floats  #: Sigma of noise and multipath used for the weights, shape (T, K).
     cn0_dbhz: Floats  #: Carrier-to-noise density, shape (T, K).
     group_delay_m: Floats  #: Group delay subtracted from the code, shape (T, K).
-    #: Standard deviation of an incompletely broadcast group delay, in addition to `TwoFrequencyLimits.delay_sigma_m`;
+    #: Sigma of the group delay where only part of it is broadcast, in addition to `TwoFrequencyLimits.delay_sigma_m`;
     #: shape (T, K).
     delay_sigma_m: Floats
     ratio: Floats  #: Square of the ratio of the first to the second frequency, shape (T, K).
@@ -71,20 +71,20 @@ class CorrectedRanges(AntennaRanges, OnDemand):
     observations: Observations
     channels: Channels
     satellites: SatelliteStates
-    #: Delays subtracted from the codes; 0 if the model is off, NaN where SBAS provides none; shape (T, K).
+    #: Delays subtracted from the codes, shape (T, K); 0 if the model is off, NaN where SBAS has no delay.
     ionosphere_m: Floats
     troposphere_m: Floats
     #: Standard deviation of satellite and atmospheric errors, from SBAS or from `NominalErrors`; shape (T, K).
     nominal_m: Floats
-    #: Standard deviation that `NominalErrors` assumes by elevation and ionospheric delay; 0 with SBAS; shape (T, K).
+    #: Sigma computed by `NominalErrors` from elevation and ionospheric delay, shape (T, K); 0 with SBAS.
     nominal_elevation_sigma_m: Floats
     #: Overbounding sigma and largest nominal bias of each range from an error model; 0 without a model; shape (T, K).
     bound_sigma_m: Floats
     bias_m: Floats
-    #: True at epochs with an unidentified gross error, which noise and map estimates leave out; shape (T,).
+    #: True at epochs with an unidentified gross error, shape (T,). Noise and map estimates exclude these epochs.
     unsure: Masks
     second: SecondCodes | None = None  #: Second codes of the satellites (`find_second_codes`); None if not used.
-    base: BaseDifferences | None = None  #: Corrections from a base station that were subtracted.
+    base: BaseDifferences | None = None  #: Subtracted base-station corrections.
 
     @property
     def columns(self) -> Indices:
@@ -93,21 +93,21 @@ class CorrectedRanges(AntennaRanges, OnDemand):
 
     @property
     def vertical_ionosphere_m(self) -> Floats:
-        """Vertical ionospheric delay on L1 by the model in use, shape (T,); 0 without a model."""
+        """Vertical ionospheric delay on L1 from the model in use, shape (T,); 0 without a model."""
         return vertical_delay_m(self.ionosphere_m, self.elevation_deg, self.frequency_hz)
 
     @property
     def used_code_m(self) -> Floats:
-        """Corrected codes, NaN where there is a rejection reason, shape (T, K)."""
+        """Corrected codes, shape (T, K); NaN where rejected."""
         return np.where(self.reason == 0, self.corrected_code_m, np.nan)
 
 
 class SatelliteRanges(NamedTuple):
-    """Satellites of a log, and clock corrections of the codes, T epochs by K channels."""
+    """Satellite positions and clocks, and the clock corrections of the codes, T epochs by K channels."""
 
     source: SourceSatellites
     correction_m: Floats  #: Satellite clock minus group delay, to be added to the codes; shape (T, K).
-    reason: Bits  #: `reasons.Reason` bits of codes, records and corrections; 0 if usable; shape (T, K).
+    reason: Bits  #: Rejection reasons (`reasons.Reason` bits) of codes, records and corrections, shape (T, K).
 
     @property
     def states(self) -> SatelliteStates:
@@ -131,7 +131,7 @@ def find_satellites(
     source : CorrectionSource
         `BroadcastSource`, `SbasSource`, `DfmcSource` or `BaseStationSource`.
     max_age_s : float, optional
-        Largest difference between an epoch and the reference time of the record used, if less than the record's
+        Largest difference between an epoch and a record's reference time, where this is shorter than the record's
         validity.
     """
     code = observations.code_m[:, channels.columns]
@@ -227,12 +227,12 @@ def corrected_ranges(
 
 
 def is_pseudorange(code_m: Floats) -> Masks:
-    """Return whether values are plausible pseudoranges, any shape; false for NaN."""
+    """Return True for plausible pseudoranges, any shape; False for NaN."""
     return np.asarray((code_m > PLAUSIBLE_CODE_M[0]) & (code_m < PLAUSIBLE_CODE_M[1]))
 
 
 def is_orbit(sat_ecef_m: Floats) -> Masks:
-    """Return whether positions (..., 3) are plausible for a navigation satellite; false for NaN."""
+    """Return True for plausible positions (..., 3) of a navigation satellite; False for NaN."""
     radius = np.sqrt(np.einsum("...i,...i->...", sat_ecef_m, sat_ecef_m))
     return np.asarray((radius > ORBITS_M[0]) & (radius < ORBITS_M[1]))
 

@@ -35,7 +35,7 @@ __all__ = [
 ]
 
 
-#: Sets of samples from which the statistics of a bin can be computed, from the bin's own samples to those of all bins.
+#: Sets of samples for the statistics of a bin, from the bin's own samples to the samples of all bins.
 POOLED: Final = ("own", "all azimuths", "all azimuths and C/N0", "all azimuths and elevations", "all")
 
 
@@ -47,8 +47,8 @@ class ErrorBins(Settings):
         "Edges of the elevation bins.", (0.0, 15.0, 30.0, 45.0, 60.0, 90.0), name="--elevations", metavar="DEG,..."
     )
     sectors: int = option("Number of azimuth sectors; the first is centred ahead of the car.", 4, metavar="N", ge=1)
-    #: C + 1 edges in ascending order; values beyond the outer edges belong to the outer bins, and observations without
-    #: C/N0 to the lowest bin.
+    #: C + 1 edges in ascending order; values beyond the outer edges belong to the outer bins. Observations without C/N0
+    #: belong to the lowest bin.
     cn0_dbhz: tuple[float, ...] = option(
         "Edges of the C/N0 bins; 0,60 makes a single bin.",
         (0.0, 30.0, 35.0, 40.0, 45.0, 60.0),
@@ -90,7 +90,7 @@ class ErrorBins(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class BinStatistics:
-    """Statistics of every bin, shape (E, A, C); NaN where the pooled samples are fewer than three."""
+    """Statistics of every bin, shape (E, A, C); NaN for fewer than three pooled samples."""
 
     count: Integers  #: Number of samples in the bin.
     #: Number of blocks in the bin. A block has the samples of one satellite in a time interval
@@ -115,7 +115,7 @@ class ErrorModelSource(Settings):
     files: tuple[tuple[str, str], ...] = ()  #: Name and SHA-256 of each file.
 
 
-LARGEST_PRIOR: Final = 0.05  #: Largest upper bound of a fault prior with which a protection level can be finite.
+LARGEST_PRIOR: Final = 0.05  #: With a larger upper bound of a fault prior, no protection level is finite.
 
 
 class FaultRate(Settings):
@@ -136,16 +136,16 @@ class FaultRate(Settings):
     #: Number of time intervals in which two or more satellites are faulty, divided by the number expected for
     #: independent satellites; 0 without faults.
     together: float = Field(ge=0)
-    #: Number of time intervals with at least two low satellites on one side of the track, added for both sides.
+    #: Number of time intervals with at least two low satellites on a side of the track, summed over both sides.
     side_blocks: int = Field(default=0, ge=0)
-    #: Number of these time intervals in which at least two of the low satellites were faulty.
+    #: Number of these time intervals in which at least two of these low satellites were faulty.
     side_faulty_blocks: int = Field(default=0, ge=0)
     #: Upper end of the one-sided 95 % confidence interval of the probability that low satellites of one side are faulty
-    #: together, computed from `side_blocks` and `side_faulty_blocks`; 1 without such blocks. The value is used for
+    #: together, computed from `side_blocks` and `side_faulty_blocks`; 1 if `side_blocks` is 0. The value is used for
     #: `side_prior` if it is small enough for a finite protection level.
     side_upper: float = Field(default=1.0, ge=0, le=1)
-    #: Stretches with more frequent local faults than the whole line (`faulty_stretches`): first and last chainage of
-    #: each [m].
+    #: Stretches with more frequent local faults than the line as a whole (`faulty_stretches`): first and last chainage
+    #: of each [m].
     no_level_m: tuple[tuple[float, float], ...] = ()
 
     @property

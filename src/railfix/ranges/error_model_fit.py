@@ -21,16 +21,16 @@ from railfix.core.options import option
 from railfix.core.settings import Settings
 from railfix.ranges.error_model import POOLED, BinStatistics, ErrorBins, ErrorModel, FaultRate
 
-TAIL_SCORE: Final = 1.0  #: Least standard score of a sample in the tail; the tail determines sigma.
+TAIL_SCORE: Final = 1.0  #: Samples beyond this standard score are the tail, which determines sigma.
 
 
 def gaussian_overbound(error_m: Floats) -> tuple[float, float]:
-    """Return bias and sigma [m] with which normal distributions shifted by +bias and -bias bound a sample (n,).
+    """Return bias and sigma [m] of two normal distributions, shifted by +bias and -bias, that bound a sample (n,).
 
     The k-th of n samples from either end is the quantile of probability ``k / (n + 1)``. Sigma is the least value that
-    bounds both tails (beyond one standard score) for a bias equal to the absolute median; the bias is then the least
-    value that bounds all samples. Beyond the largest sample the bound is an extrapolation by the normal distribution.
-    Raises ValueError for fewer than three samples, or a sample that is not finite.
+    bounds both tails (beyond one standard score) if the bias equals the absolute median. With this sigma, the bias is
+    the least value that bounds all samples. Beyond the largest sample the bound is an extrapolation by the normal
+    distribution. Raises ValueError for fewer than three samples, or a sample that is not finite.
     """
     if len(error_m) < 3 or not np.isfinite(error_m).all():
         raise ValueError("an overbound needs at least three samples, all finite")
@@ -72,7 +72,7 @@ class ErrorSamples:
     #: errors are correlated.
     block: Integers
     used: Masks  #: Samples that passed every screen, shape (n,).
-    sigma_m: Floats  #: Standard deviation that the protection level of the run assumes for the range, shape (n,).
+    sigma_m: Floats  #: Sigma that the run's protection level assumes for the range, shape (n,).
     chainage_m: Floats  #: Chainage of the train; NaN where unknown; shape (n,).
 
 
@@ -141,7 +141,7 @@ _SIDES: Final = {1: ("all round",), 2: ("ahead", "behind"), 4: ("ahead", "right"
 
 
 def summary(model: ErrorModel) -> Iterator[tuple[str, ...]]:
-    """Yield the rows of a table: one for each interval of elevation, for each sector and for each interval of C/N0.
+    """Yield the rows of a table: one for each elevation interval, each azimuth sector and each C/N0 interval.
 
     A row has a name, and count, bias, sigma and overbound before and after the screens. Bias and sigma are combined
     from the bins of the row with the counts as weights. The overbound is stated as the smallest and the largest
@@ -175,7 +175,7 @@ def _cells(statistics: BinStatistics, axis: int, k: int) -> tuple[str, str, str,
 
 _BEYOND_SIGMA: Final = 5.0  #: Multiple of the sigma of a range above which an error is a fault.
 _CONFIDENCE: Final = 0.95  #: Confidence level of the bounds of fault rates.
-#: Elevation up to which satellites count as low, equal to `RiskBudget.side_elevation_deg` [deg].
+#: Satellites up to this elevation [deg] count as low; it equals `RiskBudget.side_elevation_deg`.
 _SIDE_ELEVATION_DEG: Final = 45.0
 #: Length of the parts of the line that are compared with the whole line [m].
 _STRETCH_M: Final = 100.0

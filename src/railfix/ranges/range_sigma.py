@@ -43,8 +43,8 @@ def code_sigma_m(cn0_dbhz: Floats, elevation_deg: Floats, *, noise: CodeNoise | 
     return np.asarray(np.hypot(sigma, noise.floor_sigma_m))
 
 
-#: Accuracies stated in records (URA, SISA) up to this value are covered by `satellite_sigma_m`; 2 to 4.85 m are usual.
-#: A worse accuracy is added to the sigma of the satellite's ranges [m].
+#: `satellite_sigma_m` covers accuracies stated in records (URA, SISA) up to this value [m]; 2 to 4.85 m are usual. A
+#: worse accuracy is added to the sigma of the satellite's ranges.
 _USUAL_ACCURACY_M: Final = 5.0
 
 
@@ -61,19 +61,19 @@ class NominalErrors(Settings):
     #: Vertical delay error of the Klobuchar model. The error is mostly common to all satellites, but treated as
     #: independent.
     ionosphere_sigma_m: float = Field(default=1.0, ge=0)
-    #: Minimum ionospheric error as a fraction of the modelled slant delay, which depends on local time, season and
-    #: solar activity; a fifth is the value of DO-229D J.2.3. Where it exceeds a vertical error of 1 m, it also widens
-    #: the filter's sigma and level, unless SBAS or a base station corrects the ionosphere. 0 disables it.
+    #: Minimum ionospheric sigma as a fraction of the modelled slant delay; DO-229D J.2.3 uses one fifth. If this
+    #: fraction of the vertical delay exceeds 1 m, the filter's sigma and protection level also increase. They do not
+    #: increase if SBAS or a base station corrects the ionosphere. 0 disables the minimum.
     ionosphere_share: float = Field(default=0.2, ge=0)
-    #: Additional vertical delay error with typical coefficients, which is also added to the sigma of the ranges.
+    #: Additional vertical delay error of typical Klobuchar coefficients; it is also added to the sigma of the ranges.
     typical_ionosphere_sigma_m: float = Field(default=2.0, ge=0)
     #: Vertical delay error of the standard atmosphere (DO-229D A.4.2.4).
     troposphere_sigma_m: float = Field(default=0.12, ge=0)
 
     def sigma_m(self, elevation_deg: Floats, ionosphere_m: Floats) -> Floats:
-        """Return the standard deviation at elevations, any shape [m]; NaN up to 0.1 deg.
+        """Return the range error sigma, any shape [m]; NaN at elevations up to 0.1 deg.
 
-        `ionosphere_m`, same shape, are the modelled slant delays; NaN or 0 without a model.
+        `ionosphere_m` has the modelled slant delays, of the same shape; NaN or 0 without a model.
         """
         sine = np.sin(np.radians(np.where(elevation_deg > 0.1, elevation_deg, np.nan)))
         wet = 1.001 / np.sqrt(0.002001 + sine**2)
@@ -85,7 +85,7 @@ class NominalErrors(Settings):
         return np.asarray(np.sqrt(sum(parts) + (self.troposphere_sigma_m * wet) ** 2))
 
     def vertical_ionosphere_m(self, vertical_m: Floats) -> Floats:
-        """Return the standard deviation of the errors of modelled vertical delays, any shape [m]."""
+        """Return the sigma of modelled vertical delays, any shape [m]."""
         return np.maximum(self.ionosphere_sigma_m, self.ionosphere_share * vertical_m)
 
     def unusual_sigma_m(self, accuracy_m: Floats) -> Floats:

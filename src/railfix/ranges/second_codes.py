@@ -25,7 +25,7 @@ def find_second_codes(corrected: CorrectedRanges, source: CorrectionSource, nois
 
     The second code is the first signal, in order of preference, that is observed, healthy and has a group delay.
     Satellite position and clock are the same as for the first code, and the group delay is from the same record; where
-    the record lacks a part of the group delay, another message of the satellite is used. Where `source` requires second
+    the record lacks a part of the group delay, a record of another message type is used. Where `source` requires second
     codes, satellites without a second code are rejected with the reason `sbas_no_ionosphere`.
     """
     channels = corrected.channels
@@ -92,8 +92,8 @@ def _delays(
 def signal_delays(navigation: Navigation, signal: str) -> tuple[Floats, Floats, Masks]:
     """Return the group delay of a signal and its sigma [m], and whether the signal is unhealthy, for n records.
 
-    For GPS, QZSS and BeiDou the clocks of all messages refer to the same signals, so a missing delay is taken from the
-    satellite's nearest record of another message.
+    For GPS, QZSS and BeiDou, the clocks of all message types refer to the same signals. A missing delay is therefore
+    taken from the record of another message type that is nearest in time.
     """
     records = navigation.kepler
     clock = "ionosphere_free" if navigation.precise is not None else "broadcast"

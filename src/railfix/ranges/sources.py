@@ -25,7 +25,7 @@ class SourceSatellites(NamedTuple):
     """Satellites of a source, T epochs by K channels."""
 
     states: SatelliteStates  #: States at the times of transmission, with the source's corrections.
-    fast_m: Floats | None  #: Correction of the codes in addition to the satellite clocks, shape (T, K).
+    fast_m: Floats | None  #: Code corrections in addition to satellite clocks, shape (T, K).
     reason: Bits  #: Rejection reasons of satellites that the source does not correct, shape (T, K).
     fixes: object = None  #: Corrections of the satellites, which `delays` of the same source uses.
 
@@ -34,23 +34,23 @@ class SourceSatellites(NamedTuple):
 class BaseDifferences:
     """Corrections from a base station to the ranges of a train, T epochs by K channels."""
 
-    #: Corrections of codes and phases; NaN without a recent value of the station; shape (T, K).
+    #: Corrections of codes and phases, shape (T, K); NaN if the station has no recent value.
     code_m: Floats
     phase_m: Floats
-    arc: Integers  #: Number of the arc of the station's phase, shape (T, K).
-    #: Standard deviation of the satellite and atmospheric errors that remain in the difference of codes, shape (T, K).
+    arc: Integers  #: Arc number of the station's phase, shape (T, K).
+    #: Sigma of the satellite and atmospheric errors that remain after the code correction, shape (T, K).
     sigma_m: Floats
 
 
 class SourceDelays(NamedTuple):
-    """Delays and standard deviations of a source, T epochs by K channels."""
+    """Delays from a correction source and range error sigmas, T epochs by K channels."""
 
     delays: Delays  #: Delays that are subtracted from the codes.
-    sigma_m: Floats  #: Sigma of the errors that the weights include in addition to receiver noise, shape (T, K).
-    #: Standard deviation of satellite and atmospheric errors, and the part that `NominalErrors` assumes; shape (T, K).
+    sigma_m: Floats  #: Sigma used for the weights in addition to receiver noise, shape (T, K).
+    #: Sigma of satellite and atmospheric errors, and the part of it computed by `NominalErrors`; shape (T, K).
     nominal_m: Floats
     nominal_elevation_sigma_m: Floats
-    base: BaseDifferences | None = None  #: Corrections from a base station that were subtracted.
+    base: BaseDifferences | None = None  #: Subtracted base-station corrections.
     floor: Literal["added", "included"] = "added"  #: Whether `sigma_m` includes the error floor of the codes.
 
 
@@ -68,16 +68,16 @@ class CorrectionSource(Protocol):
     def satellites(
         self, time: Datetimes, channels: Channels, code_m: Floats, *, max_age_s: float | None = None
     ) -> SourceSatellites:
-        """Return the satellites at the times of transmission of codes, shape (T, K) [m]."""
+        """Return the satellites at the transmission times of the codes, shape (T, K) [m]."""
 
     def delays(self, time: Datetimes, channels: Channels, satellites: SourceSatellites, seen: SeenFrom) -> SourceDelays:
-        """Return the delays of the signals at approximate positions of the antenna."""
+        """Return the signal delays at approximate antenna positions."""
 
 
 def choose_ionosphere(
     navigation: Navigation, ionosphere: str, nominal: NominalErrors
 ) -> tuple[Floats | None, float, tuple[str, ...]]:
-    """Return Klobuchar coefficients, the sigma that they add to the vertical delay [m], and a note on a substitute.
+    """Return Klobuchar coefficients, their additional vertical delay sigma [m], and notes on substituted coefficients.
 
     The order of preference is GPS coefficients, QZSS coefficients, `TYPICAL_KLOBUCHAR`; the coefficients are None if
     `ionosphere` is "off". BeiDou's coefficients are not used, because they are for a different model.
@@ -102,7 +102,7 @@ class BroadcastSource:
 
     navigation: Navigation
     klobuchar: Floats | None  #: Coefficients, shape (8,); None leaves the ionosphere uncorrected.
-    #: Additional standard deviation of the vertical delay if the coefficients were not received.
+    #: Additional sigma of the vertical delay if the coefficients were not received.
     ionosphere_sigma_m: float = 0.0
     troposphere: Literal["saastamoinen", "off"] = "saastamoinen"
     nominal: NominalErrors = field(default_factory=NominalErrors)  #: Assumed satellite and atmospheric errors.

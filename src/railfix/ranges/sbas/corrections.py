@@ -44,7 +44,7 @@ _SIGMA_UDRE: Final = np.sqrt(np.array([*UDRE_VARIANCE_M2, np.nan, np.nan, np.nan
 
 
 def best_prn(messages: SbasMessages, limits: SbasLimits | None = None) -> tuple[int, str]:
-    """Return the PRN with the most usable fast corrections (the smallest of several), and a sentence on the choice.
+    """Return the PRN with the most usable fast corrections (the smallest such PRN), and a note on the choice.
 
     The choice depends on all messages of a log, and must be made before positioning begins. For live messages, the PRN
     must therefore be given.
@@ -87,7 +87,7 @@ class SbasCorrections:
         self.unused: Mapping[str, int] = {
             kind: number for kind, number in sorted((self._tables.unused + self._grid.unused).items()) if number
         }
-        #: One sentence on each correction that was requested and used; after `from_log`, also on unused messages.
+        #: Notes on the messages and on the corrections; after `from_log`, also on unused corrections.
         self.notes: tuple[str, ...] = (*notes, self._settings_note())
 
     @classmethod
@@ -227,7 +227,7 @@ class SbasCorrections:
     def ionosphere(
         self, time: Datetimes, latitude_deg: Floats, longitude_deg: Floats, elevation_deg: Floats, azimuth_deg: Floats
     ) -> IonosphereDelays:
-        """Return slant delays on L1 that the grid implies for positions (T,) and directions to satellites (T, K)."""
+        """Return slant delays on L1 from the grid, for positions (T,) and directions to satellites (T, K)."""
         return ionosphere(
             self._grid, self._tables, self.limits, time, latitude_deg, longitude_deg, elevation_deg, azimuth_deg
         )

@@ -154,7 +154,7 @@ LAYOUTS: Final[dict[str, Layout]] = {
 
 
 def read_fields(bits: Bytes, layout: Layout, offset: int = 0) -> Decoded:
-    """Decode the fields of a layout, which begins at the bit `offset`, from the bytes of messages, shape (n, 32).
+    """Decode the fields of a layout that begins at the bit `offset`, from message bytes of shape (n, 32).
 
     Arrays have shape (n,) or (n, number) and type int64, or float64 where the field has a scale.
     """
@@ -223,7 +223,7 @@ def fast_corrections(messages: SbasMessages, *, type0: Literal["stop", "as_type2
 
 
 def has_data(bits: Bytes) -> Masks:
-    """Return whether any data bit of messages is set, shape (n,)."""
+    """Return True for messages with any data bit set, shape (n,)."""
     return np.asarray(np.unpackbits(np.ascontiguousarray(bits), axis=1)[:, 14:226].any(axis=1))
 
 
@@ -247,7 +247,7 @@ def _join(parts: Sequence[Decoded]) -> Decoded:
 
 
 def long_term(messages: SbasMessages) -> Decoded:
-    """Return long-term corrections of types 25 and 24, one row per satellite; `reference` is NaT without velocity."""
+    """Return long-term corrections of types 25 and 24, one row per satellite; `reference` is NaT if not sent."""
     parts: list[Decoded] = []
     for kind, start in ((25, 14), (25, 120), (24, 120)):
         row = find_rows(messages, kind)

@@ -13,12 +13,12 @@ has 8 bits and the fraction of the rate 4 bits, as in cssrlib, and that the issu
 B-CNAV1. BDSBAS corrects the clocks of BeiDou-3 by decimetres. Since group delays differ by metres, these corrections do
 not include group delays.
 
-Orbits of the SBAS satellites themselves, ephemerides (types 39 and 40) and almanacs (type 47), are used for a note
-only. Layouts and scales of these messages are the same in cssrlib and MAAST (L5_decodeMT39.m, 40, 47). SouthPAN
-messages of three days (`test_sbas_orbits.py`) determine two other conventions: the semi-major axis is counted from 6370
-km, and the node from the meridian of Greenwich at midnight of GPS time. It is not known whether a step of the
-inclination rate is 7 pi / 6 or 7 pi times 2^-21 1e-6 rad/s; SouthPAN sends 0, and no position is computed for an orbit
-with another rate. Orbits of BDSBAS have a different layout and are left out.
+The orbits of SBAS satellites (ephemerides in types 39 and 40, almanacs in type 47) are used for a note only. Layouts
+and scales of these messages are the same in cssrlib and MAAST (L5_decodeMT39.m, 40, 47). SouthPAN messages of three
+days (`test_sbas_orbits.py`) determine two other conventions: the semi-major axis is counted from 6370 km, and the node
+from the meridian of Greenwich at midnight of GPS time. It is not known whether a step of the inclination rate is 7 pi /
+6 or 7 pi times 2^-21 1e-6 rad/s; SouthPAN sends 0, and no position is computed for an orbit with another rate. Orbits
+of BDSBAS have a different layout and are left out.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ class DfmcCorrections:
     sigma_m: Floats  #: Sigma from the indicator and the scale, before covariance and degradation; shape (T, K).
     factor: Floats  #: Upper triangular factor of the covariance, shape (T, K, 4, 4).
     growth_m: Floats  #: Degradation of the correction since the reception, shape (T, K).
-    #: Constant added to the factor on sigma that the covariance gives for a line of sight, shape (T, K).
+    #: Constant added to the sigma factor computed from the covariance, shape (T, K).
     constant: Floats
 
     def sigma_along_m(self, line_of_sight: Floats) -> Floats:

@@ -34,7 +34,7 @@ _RTKLIB: Final = re.compile(r"(\d+)\s+(\d+(?:\.\d*)?)\s+(\d+)\s+(\d+)\s*:\s*([0-
 _EMS: Final = re.compile(r"(\d+)((?:\s+\d+){5})\s+(\d+(?:\.\d*)?)\s+(\d+)\s+([0-9A-Fa-f]+)")
 _RINEX_HEAD: Final = re.compile(r"(\d{1,3})((?:\s+\d+){5})\s+(\d+(?:\.\d*)?)(?:\s+([A-Z]\d)\s+(\d+)\b.*)?")
 _RINEX_BYTES: Final = 18
-#: Time from the first bit, to which RINEX type B refers, to the reception of the complete message [s].
+#: RINEX type B states the time of a message's first bit; the message is complete this much later [s].
 _RINEX_SHIFT_S: Final = 1.0
 
 
@@ -193,7 +193,7 @@ def _instant(date: str, second: str) -> int:
     return int((start - GPS_EPOCH).astype(np.int64)) + round(value * 1e9)
 
 
-#: Number of digits of a message cut after the 226 data bits; the last 6 of these 232 bits are parity or zeros.
+#: Number of hexadecimal digits of a message that is cut after its 226 data bits; 6 bits of parity or zeros follow.
 _SHORT: Final = 58
 
 
@@ -227,8 +227,8 @@ def read_sbas(
     Returns
     -------
     SbasMessages
-        Messages in the order of reception. Times in RTKLIB and EMS files are taken as the ends of messages; times in
-        RINEX refer to the first bit and are increased by 1 s.
+        Messages in the order of reception. Times in RTKLIB and EMS files are assumed to be the ends of messages. Times
+        in RINEX refer to the first bit and are increased by 1 s.
 
     Raises
     ------
@@ -293,7 +293,7 @@ def _read_file(path: str, number: int, broken_lines: BrokenLines, gathered: _Gat
 
 
 def _check(gathered: _Gathered, sources: tuple[str, ...], band: Band) -> SbasMessages:
-    """Check parity, preamble and order, and return the messages that are not damaged or repeated."""
+    """Check parity, preamble and order, and return the messages that are neither damaged nor repeated."""
     raw = gathered.raw
     text = "".join(item.digits.ljust(2 * ROW_BYTES, "0")[: 2 * ROW_BYTES] for item in raw)
     bits = np.frombuffer(bytes.fromhex(text), dtype=np.uint8).reshape(-1, ROW_BYTES).copy()

@@ -78,10 +78,10 @@ POINT_OF_BIT, CELLS_OF_POINT = _layout()
 
 
 class GridTables:
-    """Masks and delays of the grid by point and time, spans in which they are constant, and a count of unused delays.
+    """Grid masks and delays by point and time, and the time spans in which masks and delays are constant.
 
-    `delays` has, by grid point, the vertical `delay_m` (NaN for "do not use"), `givei`, and the `issue` of the mask (4
-    * band + IODI). `unused` counts the delays for which no mask of the same issue was known.
+    `delays` has for each grid point the vertical `delay_m` (NaN for "do not use"), `givei`, and the mask's `issue`
+    (4 band + IODI). `unused` counts the delays for which no mask of the same issue was known.
     """
 
     def __init__(self, messages: SbasMessages, limits: SbasLimits, stops: Stops) -> None:
@@ -124,7 +124,7 @@ class GridTables:
         return self._by_issue.in_force(row, time, self._stops.last(time), self._mask_limit)
 
     def in_mask(self, point: Integers, time: Datetimes) -> Masks:
-        """Return whether points are in the newest mask of at least one of their bands, and this mask is still valid."""
+        """Return True for points in the newest mask of at least one of their bands, if this mask has not timed out."""
         inside, stop = np.zeros(np.broadcast_shapes(point.shape, time.shape), dtype=bool), self._stops.last(time)
         for cell in np.moveaxis(CELLS_OF_POINT[point], -1, 0):
             row = self._by_cell.newest(cell, time)
@@ -241,8 +241,7 @@ def _cells(latitude: Floats, longitude: Floats) -> Iterator[Callable[[Indices], 
 def _choose(
     grid: GridTables, time: Datetimes, span: Integers, latitude: Floats, longitude: Floats
 ) -> tuple[Integers, Floats, Floats]:
-    """Return the corner points (M, 4), -1 if unused, and the coordinates x and y in the cell (M,), below 75 deg
-    latitude.
+    """Return cell corners (M, 4) below 75 deg latitude, -1 if unused, and coordinates x and y in cells (M,).
     """
     point = np.full((len(latitude), 4), _NO_POINT, dtype=np.int64)
     x, y = np.zeros((2, len(latitude)))
@@ -272,7 +271,7 @@ def _choose(
 
 
 def _choose_polar(grid: GridTables, time: Datetimes, latitude: Floats, longitude: Floats) -> tuple[Integers, Floats]:
-    """Return points and weights, (M, 4), at 75 degrees and above; -1 and NaN if one of the four is not in the mask."""
+    """Return points and weights (M, 4) from 75 degrees on; -1 and NaN if one of the four points is not in the mask."""
     north = latitude >= 0.0
     sign = np.where(north, 1.0, -1.0)
     west = np.floor(longitude / 10.0) * 10.0
@@ -378,7 +377,7 @@ def _judge(
 def _weights(
     point: Integers, state: Integers, x: Floats, y: Floats, polar_weights: Floats, polar: Masks
 ) -> tuple[Floats, Masks]:
-    """Return weights of the corners (M, 4), and whether four good corners, or three around the position, exist (M,)."""
+    """Return corner weights (M, 4), and a mask (M,) of positions inside three or four good corners."""
     good = state == IonosphereState.OK
     weights = np.where(polar[:, None], polar_weights, _square_weights(x, y))
     used = good.all(axis=1)
@@ -395,7 +394,7 @@ def _weights(
 def _values(
     grid: GridTables, limits: SbasLimits, tables: SatelliteTables, time: Datetimes, t: Integers, row: Integers
 ) -> tuple[Floats, Floats, Masks]:
-    """Return vertical delay and variance of corners, (M, 4), and whether type 10 is in force at epochs `t`, (M,)."""
+    """Return corner delays and variances (M, 4), and a mask (M,) of epochs `t` at which type 10 is in force."""
     newest, in_force = degradation_row(tables, limits, time, tables.stops.last(time))
     of_ten, delays, ten = newest[t], grid.delays, tables.degradation
     variance = _GIVE_VARIANCE[delays["givei"][row]]

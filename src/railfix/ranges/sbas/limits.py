@@ -8,8 +8,8 @@ from pydantic import Field
 
 from railfix.core.settings import Settings
 
-#: Time after reception for which a message may be used [s]: first for precision approach, then for en route to
-#: non-precision approach (DO-229D, table A-25). The times for fast corrections are in `FAST_TIMEOUT_S`.
+#: Time-outs after reception [s]: the first for precision approach, the second for en route to non-precision approach
+#: (DO-229D, table A-25). Time-outs of fast corrections are in `FAST_TIMEOUT_S`.
 TIMEOUT_S: Final[dict[str, tuple[float, float]]] = {
     "mask": (600.0, 600.0),
     "udrei": (12.0, 18.0),

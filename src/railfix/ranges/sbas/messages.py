@@ -74,8 +74,8 @@ class SbasMessages(RowArrays, NotebookTable):
     time: Datetimes
     prn: Integers  #: PRN of the GEO, shape (N,).
     type: Integers  #: Message type, 0 to 63, shape (N,).
-    #: Bits of each message from the first preamble bit on, eight bits per byte, shape (N, 32). From bit 226 on they are
-    #: the parity, if the source contains it, then zeros.
+    #: Bits of each message from the first preamble bit on, eight bits per byte, shape (N, 32). The data bits are
+    #: followed by the parity, if the source contains it, then by zeros.
     bits: Bytes
     #: Number of parity bits that the source contains and that were checked: 24, 6 or 0; shape (N,).
     parity_bits: Integers

@@ -47,7 +47,7 @@ class FastInForce:
 def fast_in_force(
     tables: SatelliteTables, limits: SbasLimits, time: Datetimes, number: Integers, stop: Datetimes
 ) -> FastInForce:
-    """Find the fast corrections for satellites with numbers (1, K) in the PRN mask, -1 for none, at epochs (T, 1)."""
+    """Find the fast corrections at epochs (T, 1) for satellites with PRN mask numbers (1, K), -1 for none."""
     fast, udre = tables.fast, tables.udre
     row, of_udre = fast.newest(number, time), udre.newest(number, time)
     missing = (row < 0) | (fast.time[row] <= stop)
@@ -131,9 +131,9 @@ def _rate(
 
 
 def _nearest(fast: Series, row: Integers, before: NDArray[np.timedelta64]) -> Integers:
-    """Return, for each row, the same satellite's row nearest in time to the reception of the row minus `before`.
+    """Return, for each row, the satellite's earlier row received nearest to the time `fast.time[row] - before`.
 
-    Of two rows that are equally near, the later row is returned.
+    If two earlier rows are equally near, the later of them is returned.
     """
     wanted = fast.time[row] - before
     first = fast["fresh"][row]
@@ -215,7 +215,7 @@ def covariance_in_force(
 
 @dataclass(frozen=True, kw_only=True)
 class Growth:
-    """Degradation terms [m]; `missing` is true if type 10 is missing, `rss` where squares are summed; each (T, K)."""
+    """Degradation terms [m], shape (T, K); `missing` is True without type 10, `rss` where squares are summed."""
 
     fast_m: Floats
     rate_m: Floats
@@ -259,7 +259,7 @@ def growth(
 def _long_term_growth(
     tables: SatelliteTables, limits: SbasLimits, time: Datetimes, long_row: Integers, row: Integers
 ) -> tuple[Floats, Masks]:
-    """Return the degradation of long-term corrections (A.4.5.1.3), and a mask of those past the precision time-out."""
+    """Return the degradation of long-term corrections (A.4.5.1.3), and a mask of precision time-outs."""
     table, ten = tables.long_term, tables.degradation
     there = long_row >= 0
     since_reference = seconds(time - table["reference"][long_row])
@@ -295,11 +295,10 @@ class ServiceTable:
         self._reject = limits.incomplete == "reject"
 
     def factor(self, time: Datetimes, latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Masks]:
-        """Return the factor on sigma UDRE at positions, NaN without type 27, and a mask of incomplete sets, shape (T,).
+        """Return the sigma UDRE factor at positions (NaN without type 27), and a mask of incomplete sets, each (T,).
 
         The newest complete set of one issue is used. Inside several regions the factor of the highest priority applies,
-        or the smallest factor of equal priorities; outside all regions, the factor that the message states for outside
-        positions applies.
+        or the smallest factor among equal priorities. Outside all regions, the outside factor of the message applies.
         """
         factor, incomplete = np.full(len(time), np.nan), np.zeros(len(time), dtype=bool)
         newest = np.searchsorted(self.time, time, side="right") - 1
@@ -338,7 +337,7 @@ class ServiceTable:
 
 
 def _inside(values: Decoded, row: int, region: int, latitude_deg: Floats, longitude_deg: Floats) -> Masks:
-    """Return whether positions are in a region: a rectangle, or half of a rectangle at (latitude 1, longitude 2)."""
+    """Return True for positions in a region: a rectangle, or half of a rectangle at (latitude 1, longitude 2)."""
     north, west, south, east = (
         values[name][row, region] for name in ("latitude_1_deg", "longitude_1_deg", "latitude_2_deg", "longitude_2_deg")
     )

@@ -36,7 +36,7 @@ class SbasSource:
     def satellites(
         self, time: Datetimes, channels: Channels, code_m: Floats, *, max_age_s: float | None = None
     ) -> SourceSatellites:
-        """Return satellites with long-term and fast corrections, computed from the records to which these refer."""
+        """Return satellites with long-term and fast corrections, from the records to which the corrections refer."""
         fixes = self.corrections.satellites(time, channels.satellite, self.navigation)
         states = satellite_states(
             time, channels.satellite, channels.signal, code_m, self.navigation, max_age_s=max_age_s,
@@ -153,7 +153,7 @@ def apply_long_term(states: SatelliteStates, fixes: SatelliteCorrections) -> tup
 def sbas_delays(
     sbas: SbasCorrections, fixes: SatelliteCorrections, time: Datetimes, seen: SeenFrom, frequency_hz: Floats
 ) -> Delays:
-    """Return delays of the SBAS grid and of the DO-229D troposphere, and sigmas; NaN for uncorrected satellites."""
+    """Return SBAS grid and DO-229D tropospheric delays, and range sigmas; NaN for uncorrected satellites."""
     shape = fixes.state.shape
     ionosphere, troposphere, sigma = np.full((3, *shape), np.nan)
     reason = np.zeros(shape, dtype=np.int64)

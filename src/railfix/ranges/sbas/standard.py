@@ -12,7 +12,7 @@ import numpy as np
 from railfix.core.arrays import Floats, FrozenArrays, Integers, Masks
 from railfix.ranges.sbas.limits import TIMEOUT_S
 
-#: Systems by PRN, as assigned (WAAS gave 134 to KASS, 122 to SouthPAN).
+#: PRNs assigned to each system. PRNs 134 and 122, formerly of WAAS, are now KASS and SouthPAN.
 _SYSTEMS: Final = {
     "EGNOS": (120, 121, 123, 124, 126, 136),
     "WAAS": (131, 133, 135, 138),
@@ -164,8 +164,8 @@ class IonosphereDelays(FrozenArrays):
     """Ionospheric delays from the grid, for T epochs and K satellites."""
 
     state: Integers  #: `IonosphereState`, shape (T, K).
-    #: Slant delay on L1, to be subtracted from the code after multiplication by (f1/f)^2 for other carriers; NaN where
-    #: unknown; shape (T, K).
+    #: Slant delay on L1 to be subtracted from the code, shape (T, K); NaN where unknown. On other carriers the delay is
+    #: (f1/f)^2 times as large.
     delay_m: Floats
     sigma_uire_m: Floats  #: Standard deviation of the slant delay on L1; NaN where unknown; shape (T, K).
     #: Pierce point, shape (T, K).

@@ -23,7 +23,7 @@ from railfix.ranges.sources import BroadcastSource, CorrectionSource
 class SbasState:
     """Messages of one GEO received so far; `add_messages` returns a new state with further messages.
 
-    However the messages are divided into parts, the corrections at an epoch are the same as from the complete log: a
+    The corrections at an epoch are the same as from the complete log, however the messages are divided into parts: a
     message is used from its reception on, and `drop_before` drops only messages that no later epoch can use.
 
     ::
@@ -39,7 +39,7 @@ class SbasState:
     #: Messages of this PRN, in the order of reception.
     messages: SbasMessages = field(default_factory=SbasMessages.none)
     band: Band = "L1"  #: Frequency of the messages.
-    #: For a recorded log, sentences on its messages and on the corrections from them; None for live messages.
+    #: Notes on the messages and corrections of a recorded log; None for live messages.
     log_notes: tuple[str, ...] | None = None
 
     @classmethod
@@ -63,7 +63,7 @@ class SbasState:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """One sentence on each correction that was requested and used, and on the messages of a recorded log."""
+        """Notes on the corrections, and on the messages of a recorded log."""
         return self.corrections.notes if self.log_notes is None else self.log_notes
 
     def add_messages(self, messages: SbasMessages) -> SbasState:

@@ -89,7 +89,7 @@ class Series:
         return np.where(row >= 0, self.time[row], LONG_AGO)
 
     def in_force(self, row: Integers, time: Datetimes, stop: Datetimes, limit_s: float) -> Masks:
-        """Return whether rows (-1 for none) were received after the last stop of the GEO, and at most `limit_s` ago."""
+        """Return True for rows received after the last stop of the GEO and at most `limit_s` ago; False for row -1."""
         received = self.received(row)
         return np.asarray((row >= 0) & (received > stop) & (seconds(time - received) <= limit_s))
 
@@ -138,7 +138,7 @@ class MaskTable:
         return table.in_force(row, time, self._stops.last(time), self._limit)
 
     def holds(self, number: Integers, time: Datetimes) -> tuple[Masks, Masks]:
-        """Return whether the newest mask is active (T,), and whether this mask then contains the satellites (T, K)."""
+        """Return True for epochs (T,) with an active PRN mask, and True for satellites (T, K) in this PRN mask."""
         row = self._by_time.newest(0, time)
         known = self._in_force(self._by_time, row, time)
         return known, self._by_time["member"][row][:, np.maximum(number, 0)] & known[:, None]
@@ -154,7 +154,7 @@ class MaskTable:
 class SatelliteTables:
     """Tables of all messages of one GEO that concern satellites, by the number of the satellite in the PRN mask.
 
-    `fast` has fast corrections; the column `fresh` is the first row since the satellite was last not monitored. `udre`
+    `fast` has fast corrections; the column `fresh` is the satellite's first row after its last unmonitored row. `udre`
     has the UDREI from fast corrections and type 6; `grows_from` is the reception time from which degradation and
     time-out are counted. `fast_degradation` has type 7; `shortest` is the indicator with the shortest time-out in the
     same message. `long_term` has long-term corrections; `other` is the last row with another IODE, -1 for none.
