@@ -1,6 +1,6 @@
 """Messages from the centre to a train: movement authority with speed limits, and order to brake.
 
-Each message is a canonical CBOR array of the kind of the message, the version, and the fields.
+Each message is a canonical CBOR array. It contains the kind of message, the format version and the fields.
 """
 
 from __future__ import annotations
@@ -27,24 +27,23 @@ class Authority(Message):
 
     kind: ClassVar[int] = 1
     train: Annotated[int, Field(ge=0, lt=1 << 32)]
-    #: Number of the authority, which rises with every authority sent to the train, even after the centre has restarted.
+    #: Number of the authority. It rises with every authority sent to the train, also across restarts of the centre.
     number: Number
-    #: Sequence number of the train's newest report that the centre has stored, 0 before the first report. The authority
-    #: acknowledges this report. On board, the age of the authority is the time since this report was sent.
+    #: Sequence number of the newest report that the centre has stored for the train, 0 before the first report. The
+    #: authority acknowledges this report. On board, the age of the authority is the time since this report was sent.
     report: Number
     end_cm: Chainage  #: Chainage where the authority ends.
     direction: Literal[-1, 1]
     stopped: bool  #: Whether the train is ordered to stop.
-    #: Whether the train is requested to accept `end_cm` instead of the farther end of an earlier authority, if the
-    #: train can stop before `end_cm`.
+    #: Whether the train is requested to shorten its earlier authority to `end_cm`, if it can stop before `end_cm`.
     shortens: bool = False
-    #: Session in which `report` was sent; the on-board unit draws a new identifier at each start.
+    #: Identifier of the session in which `report` was sent. The on-board unit draws a new identifier at each start.
     session: Annotated[int, Field(ge=0, lt=1 << 62)] = 0
     overlap_cm: Number = 0  #: Distance kept free beyond the end for a train that passes the end at release speed.
     #: Lower chainage [cm], upper chainage [cm] and highest speed [cm/s] of each speed restriction in the train's
     #: interval.
     restrictions: Annotated[tuple[SpeedPart, ...], Field(max_length=MOST_PARTS)] = ()
-    #: Chainage [cm] from which each gradient applies, until the next part's chainage, and gradient [per mille],
+    #: Chainage [cm] and gradient [per mille] of each part. A gradient applies up to the next part's chainage, and is
     #: positive where the track rises with the chainage.
     gradients: Annotated[tuple[GradientPart, ...], Field(max_length=MOST_PARTS)] = ()
 
@@ -55,12 +54,12 @@ class Authority(Message):
 
     @classmethod
     def decode(cls, data: bytes) -> Authority:
-        """Return the authority, or the `BrakeOrder`, decoded from bytes.
+        """Decode an authority or a `BrakeOrder`.
 
         Raises
         ------
         MessageError
-            The bytes are not an authority of this version.
+            The bytes are not a valid message of this version.
         """
         cbor2 = cbor()
         try:
@@ -74,13 +73,13 @@ class Authority(Message):
         if len(values) != len(model.model_fields):
             raise MessageError(f"has {len(values)} fields, {len(model.model_fields)} were expected")
         message = validate_message(model, dict(zip(model.model_fields, values, strict=True)))
-        if message.encode() != data:  # not canonical, such as trailing bytes or a boolean in place of a number
+        if message.encode() != data:  # not canonical: trailing bytes, or a boolean instead of a number
             raise MessageError("is not an authority in canonical form")
         return message
 
 
 class BrakeOrder(Authority):
-    """Order to brake to a stop, sent without waiting for a commit and repeated until a report names this order.
+    """Order to brake to a stop, sent before the centre has stored it, and repeated until a report acknowledges it.
 
     `number` is the number of the latest authority. A later authority without `stopped` ends the order.
     """

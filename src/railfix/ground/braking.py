@@ -32,7 +32,7 @@ class BrakeLimits(Settings):
     cut_s: float = Field(default=0.5, ge=0)
     traction_mps2: float = Field(default=0.5, ge=0)  #: Acceleration until traction is cut off.
     warning_s: float = Field(default=1.0, ge=0)  #: Time from the warning to the intervention.
-    #: Driver's reaction time; the permitted-speed curve is this time ahead of the intervention curve.
+    #: Driver's reaction time: time from exceeding the permitted speed to the intervention.
     reaction_s: float = Field(default=3.0, ge=0)
     over_mps: float = Field(default=1.5, ge=0)  #: Excess over a restricted speed at which the intervention begins.
 
@@ -45,17 +45,17 @@ class Target(NamedTuple):
 
 
 class Steps(NamedTuple):
-    """Gradients, positive uphill, each from its position to the next position; 0 before the first position."""
+    """Gradients, positive uphill. Each applies up to the next position; the line is level before the first position."""
 
     from_m: Sequence[float] = ()
     gradient: Sequence[float] = ()
 
 
 def braking_speed(at_m: float, target: Target, steps: Steps, brakes: BrakeLimits) -> float:
-    """Return the square of the speed at `at_m` from which braking leads to the target speed at the target [m2/s2].
+    """Return the square of the speed on the braking curve at `at_m` [m2/s2].
 
-    ``v^2 = v_target^2 + 2 integral of max(safety a + g i, least)`` from `at_m` to the target, with a: `braking_mps2`,
-    g: gravity, i: gradient, least: `least_mps2`. Beyond the target, the result is below ``v_target^2``.
+    The square is ``v_target^2 + 2 integral of max(safety a + g i, least)`` from `at_m` to the target, with a:
+    `braking_mps2`, g: gravity, i: gradient, least: `least_mps2`. Beyond the target, the result is below ``v_target^2``.
     """
     if at_m >= target.at_m:
         return target.speed_mps**2 - (at_m - target.at_m)
@@ -102,11 +102,11 @@ def _after_build_up(at_m: float, speed_mps: float, brakes: BrakeLimits) -> tuple
 
 
 def intervention_mps(at_m: float, target: Target, steps: Steps, brakes: BrakeLimits, *, before_s: float = 0.0) -> float:
-    """Return the highest speed at which an intervention, now or `before_s` later, is in time for the target [m/s].
+    """Return the highest speed at which an intervention `before_s` later is in time for the target [m/s].
 
     At this speed, the train is on the curve of `braking_speed` when the brakes act. Between two changes of gradient,
-    the position at which the brakes act is linear in the train's speed, and the square of the curve is linear in this
-    position. This gives one quadratic equation per gradient; the equations are solved from the target backward.
+    the position at which the brakes act is linear in the train's speed, and `braking_speed` is linear in this position.
+    This gives one quadratic equation per gradient; the equations are solved from the target backward.
     """
     if at_m >= target.at_m:
         return 0.0
@@ -126,7 +126,7 @@ def intervention_mps(at_m: float, target: Target, steps: Steps, brakes: BrakeLim
 
 
 def _largest(fits: Callable[[float], bool]) -> float:
-    """Return the largest speed for which `fits` is true, or 0 [m/s]; `fits` must be true for all lower speeds."""
+    """Return the limit speed [m/s] below which `fits` is true and above which it is false."""
     low, high = 0.0, _TOP_MPS
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
@@ -186,7 +186,7 @@ def _supervised(
 ) -> Supervised:
     """Return the supervised speeds for one target.
 
-    No speed is below the target speed, nor, up to the target, below `release` [m/s].
+    No speed is below the target speed. Before the target, no speed is below `release` [m/s].
     """
     aimed = target if target.speed_mps == 0.0 else target._replace(speed_mps=target.speed_mps + brakes.over_mps)
     brake, warn = (intervention_mps(front_m, aimed, steps, brakes, before_s=s) for s in (0.0, brakes.warning_s))

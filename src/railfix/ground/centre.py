@@ -22,7 +22,7 @@ from railfix.core.settings import Settings
 from railfix.io.train_message import MessageStatus, TrainMessage, Unknown
 
 #: `_RUN_MPS2`: acceleration of the reference run curve [m/s^2]. `_AT_STATION_M`: distance from a stopping position
-#: within which a train is at the station [m].
+#: within which a train counts as at the station [m].
 _RUN_MPS2, _AT_STATION_M = 0.5, 25.0
 
 
@@ -70,7 +70,7 @@ class ReferenceCurve:
         )
 
     def running_m(self, from_m: float, elapsed_s: float) -> float:
-        """Return the position that a train reaches `elapsed_s` after `from_m`, at most the next station [m]."""
+        """Return the position of a train `elapsed_s` after it was at `from_m`, at most the next station [m]."""
         at = np.interp(self.direction * from_m, self.direction * self.chainage_m, self.running_s)
         place = float(np.interp(at + max(elapsed_s, 0.0), self.running_s, self.chainage_m))
         ahead = self.direction * (self.stations_m - from_m)
@@ -89,8 +89,7 @@ class ReferenceCurve:
 
         Stations are numbered in running direction.
 
-        In P5 3.1 a train at a station reports the station, otherwise the section and the progress in percent of the
-        section's length.
+        In P5 3.1, a train reports the station if it is at a station, otherwise the section and the progress.
         """
         along = self.direction * self.stations_m
         section = int(np.clip(np.searchsorted(along, self.direction * chainage_m, side="right") - 1, 0, len(along) - 2))
@@ -107,7 +106,7 @@ class TrainState(Enum):
     TRACKED = "tracked"
     #: No report for `lost_s`: the displayed position is simulated on the reference run curve.
     SIMULATED = "simulated"
-    #: No report for too long, or the simulated position has reached the end of the authority.
+    #: No report for `error_s`, or the simulated position has reached the end of the authority.
     ERROR = "error"
 
 
@@ -117,11 +116,11 @@ class CentreLimits(Settings):
     #: Time without an accepted report after which the displayed position is simulated.
     lost_s: float = Field(default=3.0, gt=0)
     error_s: float = Field(default=120.0, gt=0)  #: Time without an accepted report after which a train is in error.
-    age_s: float = Field(default=5.0, gt=0)  #: Largest age of a position when it was sent; older reports are rejected.
-    #: Largest delay of a train's clock behind the times of the train's positions. The time between two positions is
-    #: assumed to be longer by this value, because the delay of the clock may vary.
+    age_s: float = Field(default=5.0, gt=0)  #: Largest age of a position when it is sent; older positions are rejected.
+    #: Largest lag of a train's clock behind the times of the train's positions. Because this lag may vary, the time
+    #: between two positions is assumed to be longer by this value.
     clock_s: float = Field(default=1.0, ge=0)
-    #: Largest accepted amount by which a sequence number may exceed the newest one, if it arrives immediately after it.
+    #: Largest accepted lead of a sequence number over the newest number, immediately after the newest number arrived.
     jump: int = Field(default=1000, ge=1)
     #: Increase of this largest lead per second since the newest number arrived.
     rate: float = Field(default=20.0, gt=0)
@@ -140,7 +139,7 @@ class TrainRecord:
     train: int
     state: TrainState = TrainState.UNKNOWN
     sequence: int = -1  #: Newest sequence number received, -1 before the first.
-    session: int = 0  #: Session that `sequence` belongs to; the on-board unit draws a new identifier at each start.
+    session: int = 0  #: Identifier of the session of `sequence`; the on-board unit draws a new one at each start.
     retired: tuple[int, ...] = ()  #: Identifiers of earlier sessions, whose late messages are rejected.
     counted_s: float | None = None  #: Time on the centre's clock when the newest sequence number arrived [s].
     rejected: str | None = None  #: Reason why the newest report was rejected, None if it was accepted.
@@ -148,8 +147,7 @@ class TrainRecord:
     heard_s: float = 0.0  #: Time on the centre's clock (monotonic) when `message` arrived [s].
     measured_s: float = 0.0  #: Time on the centre's clock for which the position of `message` is valid [s].
     shown_m: float | None = None  #: Displayed position of the front end [m].
-    #: Reported minus displayed position when the train last reported again after simulated running, positive in running
-    #: direction [m].
+    #: Jump of the displayed position when reports last ended simulated running, positive in running direction [m].
     jump_m: float | None = None
 
 
@@ -174,7 +172,7 @@ _RETIRED = 16
 def report_received(
     record: TrainRecord, message: TrainMessage, now_s: float, *, limits: CentreLimits
 ) -> tuple[TrainRecord, Rejection | None]:
-    """Return the record after a report, and the reason for rejecting the report, None if it is accepted.
+    """Return the record after a report, and the reason if the report is rejected, otherwise None.
 
     The time of the measurement is the time of arrival minus the age of the position. The age is computed with the
     train's own clock, so that the clocks of train and centre need not agree. The unknown delay of the link is
@@ -227,7 +225,7 @@ def time_passed(
     authority_m: float | None = None,
     limits: CentreLimits,
 ) -> TrainRecord:
-    """Return the record with state and displayed position at a later instant, if the train has not reported.
+    """Return the record at a later instant; if reports are missing, it has a new state and a simulated position.
 
     Parameters
     ----------
@@ -237,7 +235,7 @@ def time_passed(
     curves : dict of int to ReferenceCurve
         Reference run curves by running direction.
     authority_m : float, optional [m]
-        End of the train's authority, where the simulated position stops and the train is in error.
+        End of the train's authority. When the simulated position reaches it, the train is in error.
     limits : CentreLimits
     """
     if record.message is None or record.state is TrainState.UNKNOWN or record.message.chainage_cm is None:

@@ -1,8 +1,8 @@
 """Changes of trains by order: correct an interval; enter, remove, join and divide trains.
 
-Reports cannot show these changes; a person who has observed them enters them. Each change leaves the changed trains
-stopped, to be released one by one (`railfix.ground.stops.release_train`), and frees no track that a train may still
-occupy.
+Reports cannot show these changes, so that a person who has observed a change enters it. Each change leaves the changed
+trains stopped, to be released one by one (`railfix.ground.stops.release_train`), and frees no track that a train may
+still occupy.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Changed = tuple[Interlocking, str | None]
 def _placed(
     train: TrainInterval, layout: Layout, *, direction: int, rear_m: float, front_m: float, track: int
 ) -> TrainInterval | str:
-    """Return a train moved to two chainages, without an authority, or the reason why the train cannot be there."""
+    """Return a train moved to the given ends, without an authority, or the reason why this is impossible."""
     low, high = sorted((rear_m, front_m))
     if direction not in (-1, 1) or track not in (1, 2):
         return "direction must be -1 or 1, and track 1 or 2"
@@ -59,9 +59,9 @@ def correct_interval(
 ) -> Changed:
     """Set the interval of a stopped train; return the new state, and the reason if the order is refused.
 
-    The train's route and authority end, and the train's locks on points are removed. The train must therefore have
-    reported that it obeys an order to brake, and no authority in transit may be able to end that order. This is not
-    required if all authorities have lapsed on board (`lapsed`).
+    The train's route and authority end, and the train's locks on points are removed. Therefore, the train must have
+    reported that it obeys an order to brake that no authority in transit can end, or all authorities must have lapsed
+    on board (`lapsed`).
     """
     known = state.trains.get(train)
     if known is None:
@@ -153,8 +153,8 @@ def remove_train(state: Interlocking, train: int, layout: Layout, *, lapsed: boo
     trains = {number: other for number, other in state.trains.items() if number != train}
     state = replace(state, trains=trains, points=without_locks(state.points, train))
     for name, own in layout.sections.items():
-        # a section that is a whole station is barred only if the train is on the points, because the tracks are
-        # separate sections
+        # the section of a whole station is barred only if the train is on its points; the tracks are sections of their
+        # own
         if overlap(own if len(own) == 1 else [piece for piece in own if piece[0] == 0], pieces):
             state = close_section(state, name, layout, f"{name} is {OCCUPIED}", kind=OCCUPIED)
     return state, None
@@ -193,7 +193,7 @@ def join_trains(state: Interlocking, lead: int, other: int, layout: Layout) -> C
 
 
 def divide_train(state: Interlocking, train: int, other: int, *, length_m: float) -> Changed:
-    """Divide a train: the part behind the train's first `length_m` becomes the new train `other`.
+    """Divide a train after its first `length_m` metres; the rear part becomes the new train `other`.
 
     Until the parts are apart, their intervals overlap by the uncertainty of the position. Return the new state, and the
     reason if the order is refused.

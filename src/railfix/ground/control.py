@@ -1,4 +1,4 @@
-"""Control centre in operation: supervision, store, monitor of satellite positioning, log, and values of the page.
+"""Control centre in operation: supervision, store, monitor of satellite positioning, log, and values on the page.
 
 Authorities, which also acknowledge reports, are committed to the store before they are sent. A centre that is killed at
 any moment therefore restarts with every authority that its trains may have received.
@@ -41,7 +41,7 @@ def _severity(verdict: TriangleVerdict) -> int:
 
 @dataclass(kw_only=True)
 class StopOrder:
-    """Order to stop a train; times from sending to acknowledgement, and from sending to standstill [s]."""
+    """Order to stop a train, with the times from sending to acknowledgement and to standstill [s]."""
 
     number: int
     sent_s: float
@@ -83,7 +83,7 @@ class ControlCentre:
     stops: dict[int, StopOrder] = field(default_factory=dict)  #: Orders to stop, by train.
     #: Commits to the store; in a running centre, they are carried out in a thread.
     commits: Commits = field(default_factory=Commits)
-    #: Function that requests the detection of points; `Supervision.set_detected` processes the answer.
+    #: Function that requests the detection of a set of points; `Supervision.set_detected` processes the answer.
     ask: Callable[[PointName], None] = lambda _: None
     #: Interference suspected in the newest report of each train.
     interference: dict[int, SuspectedInterference] = field(default_factory=dict)
@@ -100,11 +100,11 @@ class ControlCentre:
 
     @classmethod
     def restore(cls, supervision: Supervision, store: Store, *, judged: bool, **rest: Any) -> ControlCentre:
-        """Return the centre with the state stored by an earlier process; at the first start the state is unchanged.
+        """Return the centre with the state that an earlier process stored, or at the first start with the given state.
 
-        Trains are unknown until they report; the detection of all points is requested from the field. If a triangle
-        monitors satellite positioning (`judged`), all trains are stopped at the first start until the stop is released
-        by hand. A stop from before a restart remains.
+        After a restart, trains are unknown until they report, and the detection of all points is requested. If a
+        triangle monitors satellite positioning (`judged`), all trains are stopped at the first start until the stop is
+        released by hand. A stop from before a restart remains.
         """
         texts, monitor = store.documents(HEAD), MonitorState() if judged else None
         asked: tuple[PointName, ...] = ()
@@ -129,7 +129,7 @@ class ControlCentre:
 
     @property
     def database(self) -> str | None:
-        """Reason why the database rejects the state, None if it accepts the state."""
+        """Reason why the state cannot be written to the database, None if it can be written."""
         return self.commits.alarm
 
     def log(self, text: str, *, train: int | None = None) -> None:
@@ -172,7 +172,7 @@ class ControlCentre:
             self.log(f"train {number}: first report", train=number)
 
     def _note_report(self, was: TrainInterval, known: TrainInterval, message: TrainMessage) -> None:
-        """Count and log contradictions of a report to the record, and log the answer to a request for the route."""
+        """Count and log contradictions between a report and the record, and log whether a train returns its route."""
         number = known.train
         if known.contradiction is not None:
             self.rejected["contradicts the record of the train"] += 1
@@ -210,11 +210,12 @@ class ControlCentre:
         ]
 
     def judge(self, verdict: TriangleVerdict, receiver: int = -1, *, age_s: float = 0.0) -> None:
-        """Process a verdict on satellite positioning from fixes of a given age.
+        """Process a verdict on satellite positioning from fixes of age `age_s`.
+
+        A verdict is ignored if its fixes are older than `MonitorLimits.late_s`, or farther in the future than this
+        time.
 
         Each step uses the most severe verdict since the previous step.
-
-        Fixes older than `MonitorLimits.late_s`, or farther in the future than this time, give no verdict.
         """
         if abs(age_s) > self.times.late_s:
             self.rejected["fixes of the triangle with a wrong age"] += 1
@@ -254,7 +255,7 @@ class ControlCentre:
         self.settle()
 
     def settle(self) -> None:
-        """Send messages whose commit is complete, and log when the database begins or ceases to fail."""
+        """Send messages whose commit is complete, and log when the database fails or recovers."""
         self.commits.settle(self.clock())
         alarm = self.commits.alarm
         if alarm is not None and self._alarm is None:
@@ -293,7 +294,7 @@ class ControlCentre:
         state, limits = self.supervision.state, self.supervision.centre
         for number, record in self.supervision.records.items():
             if now - record.heard_s <= limits.lost_s:
-                continue  # the record is unchanged
+                continue  # the train has reported recently
             rests = number in self.stops and state.trains[number].standstill  # a train at rest is not simulated
             curves = {} if rests else self.curves
             after = time_passed(record, now, curves=curves, authority_m=state.trains[number].end_m, limits=limits)
@@ -316,7 +317,7 @@ class ControlCentre:
         return reason
 
     def stop(self, train: int | None) -> str | None:
-        """Stop a train, or every train with None, by hand; return the reason for a refusal."""
+        """Stop a train, or every train if `train` is None, by hand; return the reason for a refusal."""
         state = self.supervision.state
         if train is not None and train not in state.trains:
             return f"no such train: {train}"
@@ -343,7 +344,7 @@ class ControlCentre:
         self.supervision.state = replace(self.supervision.state, stopped=self.monitor.stopped)
 
     def snapshot(self) -> dict[str, Any]:
-        """Return plain values of trains, points, monitor and log for the page."""
+        """Return the values of trains, points, monitor and log that the page displays."""
         layout, state = self.supervision.layout, self.supervision.state
         trains, stopped = [], stop_orders(state)
         for number, train in state.trains.items():
@@ -379,7 +380,7 @@ class ControlCentre:
         }  # fmt: skip
 
     def _place(self, direction: int, shown_m: float | None) -> str:
-        """Return the station, or the section and the progress in it, in the terms of P5 3.1; "" without a position."""
+        """Return the station, or the section and the progress in it, as in P5 3.1; "" without a position."""
         if shown_m is None or (curve := self.curves.get(direction)) is None:
             return ""
         names = [station.name for station in self.supervision.layout.stations][::direction]
@@ -389,7 +390,7 @@ class ControlCentre:
         return f"{names[section]} to {names[section + 1]}, {progress:.0f} %"
 
     def point_name(self, point: PointName) -> str:
-        """Return the displayed name of points: station, and end of the station at lower or higher chainage."""
+        """Return the displayed name of points: the station, and "lower" or "upper" for the end of the station."""
         return f"{self.supervision.layout.stations[point[0]].name} {'lower' if point[1] < 0 else 'upper'}"
 
     def _monitor_values(self) -> dict[str, Any]:

@@ -183,7 +183,7 @@ class LinkedTraffic(Traffic):
     links: dict[int, TrainLinks]
     control: ControlCentre
     verdicts: list[tuple[TriangleVerdict, int]]  #: Verdicts of the triangle, one per second.
-    rest_s: float | None = None  #: Time at which all trains had stopped [s]; None before.
+    rest_s: float | None = None  #: Time at which all trains were at rest after a stop [s]; None before.
 
     def step(self) -> None:
         """Run a step, and record the time at which all trains are at rest after a stop."""
@@ -343,7 +343,7 @@ async def _run(traffic: LinkedTraffic, relays: dict[tuple[int, LinkName], Relay]
             alone = OUTAGE_A_S[0] <= now < OUTAGE_A_S[1] and bearer == "A"
             relay.disturbance.up = not (alone or (both and number == 1))
         traffic.step()
-        # Time lost on a busy machine is not made up, because simulated time would otherwise run too fast for the links.
+        # Time lost on a busy machine is not made up, because simulated time would then run too fast for the links.
         start = max(start, loop.time() - traffic.now_s / speed)
         await asyncio.sleep(start + traffic.now_s / speed - loop.time())
 

@@ -1,4 +1,4 @@
-"""Orders given on the page: their authors and effects, and the confirmation of orders by a second order.
+"""Orders given on the page, and their confirmation by a second order.
 
 For each order, the log gets a line with the author and the outcome. Orders based on an observation that no report
 confirms are given twice: by two people, or by one person after a minimum time.
@@ -80,7 +80,7 @@ class OrderDesk:
         )
 
     def asked_s(self, name: str, values: Values) -> float:
-        """Return the time at which an order that awaits confirmation was given, otherwise the present time [s]."""
+        """Return the time at which an order was given that awaits confirmation, or else the present time [s]."""
         key = f"{name} {json.dumps(values, sort_keys=True)}"
         return self._asked.get(key, (self.clock(), ""))[0]
 
@@ -103,7 +103,7 @@ class OrderDesk:
     def twice(
         self, name: str, change: Callable[[Values], tuple[Interlocking, str | None]], what: str, values: Values, by: str
     ) -> str | None:
-        """Change trains when the order is given a second time; both orders must contain the same reason in words."""
+        """Change trains when the order is given a second time; both orders must contain the same reason."""
         reason = values.get("reason")
         if not isinstance(reason, str) or not 0 < len(reason.strip()) <= LONGEST_REASON:
             return (
@@ -120,7 +120,7 @@ class OrderDesk:
         return refused
 
     def _moved_meanwhile(self, before: Interlocking, after: Interlocking, since_s: float) -> str | None:
-        """Return a sentence if a train has, since the first order, reported a position outside its new interval."""
+        """Return a message if a train has reported a position outside its new interval since the first order."""
         for number, train in after.trains.items():
             known, record = before.trains.get(number), self.supervision.records.get(number)
             if known is None or known is train or known.reported_m is None or record is None:
@@ -165,7 +165,7 @@ class OrderDesk:
         return divide_train(state, train, other, length_m=length[0])
 
     def confirm_start(self, values: Values, by: str) -> str | None:
-        """Cease to wait for trains that have not reported since the start of the centre, when ordered a second time."""
+        """Stop waiting for trains that have not reported since the start of the centre, when ordered a second time."""
         if not self.supervision.awaited:
             return "every train has reported since the start"
         what = f"the database is not an older copy, and these trains do not report: {self.supervision.awaited_text}"
@@ -264,5 +264,5 @@ class OrderDesk:
             "divide-train": changing("divide", "the train is divided there, and both parts are at rest"),
         }
         return {name: partial(self.given, name, order) for name, order in orders.items()} | {
-            "detect-section": self.detect  # this order is repeated every few seconds
+            "detect-section": self.detect  # only changes are logged, because this order is repeated every few seconds
         }

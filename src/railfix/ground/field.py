@@ -1,4 +1,4 @@
-"""Simulated points, because railfix has no interface to real points."""
+"""Simulated points; railfix has no interface to real points."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from railfix.ground.layout import PointName
 
 @dataclass(kw_only=True)
 class SimulatedPoints:
-    """Points that lose their detection at a command, and are detected in the new position after `move_s` [s]."""
+    """Simulated points. They move for `move_s` [s] after a command, and are not detected while they move."""
 
     move_s: float
     clock: Callable[[], float]
@@ -24,7 +24,7 @@ class SimulatedPoints:
         self._answers[point] = None
 
     def ask(self, point: PointName) -> None:
-        """Request the detection of points; the next call of `take_detected` returns the detected track."""
+        """Request the detection of a set of points; the next call of `take_detected` returns their detected track."""
         self._answers[point] = None if point in self._moving else self.lie.get(point, 1)
 
     def take_detected(self) -> Mapping[PointName, int | None]:

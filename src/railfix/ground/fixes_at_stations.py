@@ -116,10 +116,10 @@ def station_fixes(logs: list[Observations], points_ecef_m: Floats, navigation: N
 
 
 def fixes_of_ranges(time: Datetimes, ranges: list[Ranges], points_ecef_m: Floats, *, cn0_fallen: Masks) -> StationFixes:
-    """Compute fixes from corrected ranges of the same satellites, as single point positions are computed in a run.
+    """Compute single point positions from corrected ranges of the same satellites, as in a run.
 
-    `ranges` has the ranges of each of N receivers at the T times of `time`; `points_ecef_m` has the shape (N, 3) and
-    `cn0_fallen` the shape (T, N).
+    `ranges` contains the ranges of each of N receivers at the T times of `time`. The shape of `points_ecef_m` is (N,
+    3), and the shape of `cn0_fallen` is (T, N).
     """
     plane = axes_at(points_ecef_m[0])[:2]
     fixes = [
@@ -217,8 +217,8 @@ def mean_cn0(log: Observations) -> Floats:
 def fallen_cn0(level_dbhz: Floats, earlier_dbhz: Floats) -> Masks:
     """Return whether the mean C/N0 of each receiver has fallen by more than `FALLEN_DBHZ`, shape (T, N).
 
-    The mean C/N0 `level_dbhz`, shape (T, N), is compared with the median over the `USUAL_EPOCHS` preceding epochs;
-    these include the epochs of `earlier_dbhz`, shape (M, N).
+    The mean C/N0 `level_dbhz`, shape (T, N), is compared with the median over the `USUAL_EPOCHS` preceding epochs.
+    `earlier_dbhz`, shape (M, N), precedes `level_dbhz`.
     """
     table = pl.DataFrame(np.vstack([earlier_dbhz, level_dbhz])).fill_nan(None)
     usual = table.select(pl.all().rolling_median(USUAL_EPOCHS, min_samples=1).shift(1)).to_numpy()
@@ -233,9 +233,9 @@ class StationStreams:
     """Fixes of receivers at known points, computed from epochs as they arrive.
 
     An epoch is used once every receiver has sent it; older epochs that still wait are then dropped. If a receiver is
-    silent, no fixes are computed, and the monitor detects that fixes are late. Records from the streams are added to
-    `navigation`. Only epochs at whole seconds are used. `counts` has the number of epochs by outcome: "used",
-    "incomplete" or "without common satellites".
+    silent, no fixes are computed, and the monitor detects that fixes are late. Navigation data from the streams are
+    added to `navigation`. Only epochs at whole seconds are used. `counts` contains the number of epochs by outcome:
+    "used", "incomplete" or "without common satellites".
     """
 
     def __init__(self, points_ecef_m: Floats, *, navigation: Navigation | None = None) -> None:
@@ -257,7 +257,7 @@ class StationStreams:
         if tag_ns % 1_000_000_000 or tag <= self._done:
             return None
         for later, epochs in list(self._waiting.items()):
-            # future time tags of one receiver would displace the other receivers' epochs
+            # drop the receiver's future epochs: wrong future tags would displace the other receivers' epochs
             if later > tag and epochs.pop(receiver, None) is not None and not epochs:
                 del self._waiting[later]
         together = self._waiting.setdefault(tag, {})

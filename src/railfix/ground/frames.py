@@ -1,8 +1,8 @@
 """Redundancy layer above two links: frames with sequence numbers and time stamps, as defences according to EN 50159.
 
-The links encrypt and authenticate frames (QUIC, TLS 1.3); the CRC of a frame detects faults of the layers between, and
-is not cryptographic. A receiver uses each frame once, from the link that delivers it first. It does not use frames that
-are older than a frame already used.
+The links encrypt and authenticate frames (QUIC, TLS 1.3); the CRC of a frame detects faults in the layers between, and
+does not protect against attacks. A receiver uses each frame once, from the link that delivers it first. It does not use
+frames that are older than a frame already used.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from railfix.core.settings import Settings
 _HEAD: Final = struct.Struct("!BIQQq")
 _ECHO: Final = struct.Struct("!Qqqq")
 _CHECK: Final = struct.Struct("!I")
-#: Longest payload, which fits a QUIC datagram together with the header [bytes].
+#: Longest payload [bytes]; a frame of this length fits a QUIC datagram.
 LONGEST_PAYLOAD: Final = 1100
 #: Number of recent sequence numbers that are stored to detect repeated frames.
 REMEMBERED: Final = 4096
@@ -47,7 +47,7 @@ class FrameKind(IntEnum):
 
 
 class Threat(Enum):
-    """Threats of EN 50159, each with its counter."""
+    """Threats of EN 50159 that a receiver counts."""
 
     REPETITION = "repetition"
     DELETION = "deletion"
@@ -95,7 +95,7 @@ class Echo(NamedTuple):
         return cls(*_ECHO.unpack(payload)) if len(payload) == _ECHO.size else None
 
     def round_trip_s(self, now_ns: int) -> float:
-        """Return the round-trip time t4 - t1 - (t3 - t2) [s]; t4 is the time of arrival `now_ns` of the echo."""
+        """Return the round-trip time without the time to the answer [s], for an echo that arrives at `now_ns`."""
         return (now_ns - self.sent_ns - (self.answered_ns - self.received_ns)) / 1e9
 
 
@@ -120,7 +120,7 @@ class _Seen:
     bits: int = 0
 
     def is_alone(self, sequence: int, now_ns: int, limits: ReceiverLimits) -> bool:
-        """Return whether a number is further ahead of the newest number than the sender can have counted meanwhile."""
+        """Return whether a number exceeds the newest number by more than the sender can have counted meanwhile."""
         most = limits.jump + limits.rate * (now_ns - self.at_ns) / 1e9
         return self.newest >= 0 and sequence > self.newest + most
 
@@ -155,7 +155,7 @@ class FrameReceiver:
     _at_ns: int = 0
 
     def receive(self, link: str, data: bytes, now_ns: int) -> tuple[Frame | None, Frame | None]:
-        """Return the frame to answer, or None, and the frame to use, or None.
+        """Return the frame to answer and the frame to use; each may be None.
 
         A second copy of a frame is answered but not used, so that both links are measured.
         """
@@ -211,7 +211,7 @@ class FrameReceiver:
         )
 
     def _late(self, frame: Frame, now_ns: int) -> bool:
-        """Return whether a frame's delay is too long compared with the shortest; the clocks need not agree."""
+        """Return whether a frame's delay exceeds the shortest delay too much; the clocks need not agree."""
         took = now_ns - frame.time_ns
         if self._shortest_ns is None:
             self._shortest_ns = float(took)

@@ -2,8 +2,8 @@
 
 A pure state machine. A train occupies the interval from its last safe rear end to the end of its authority. An
 authority is extended to a margin before the nearest of these limits: another train's interval, a section that is closed
-or occupied, points that are not locked and detected for the train, or the end of the train's route. Authorities are
-shortened only by agreement with the train (`railfix.ground.stops`); reports move the intervals
+or occupied, points that are not both locked and detected for the train, or the end of the train's route. Authorities
+are shortened only by agreement with the train (`railfix.ground.stops`). Reports move the intervals
 (`railfix.ground.reports`). Shunting, overlaps behind signals, level crossings and degraded working by hand are not
 modelled.
 """
@@ -79,7 +79,7 @@ def _place(train: TrainInterval) -> tuple[object, ...]:
 
 
 def stop_orders(state: Interlocking) -> dict[int, str]:
-    """Return the trains that must stop, with reasons: stopped trains, and the nearest trains on either side of each."""
+    """Return the trains that must stop, with reasons: stopped trains, and the trains nearest to each stopped train."""
     found = {number: train.stop for number, train in state.trains.items() if train.stop is not None}
     if not found:
         return {}
@@ -101,11 +101,11 @@ def stop_orders(state: Interlocking) -> dict[int, str]:
 
 
 def points_reported(state: Interlocking, point: PointName, detected: int | None, layout: Layout) -> Interlocking:
-    """Return the state after the field has reported the detected position of points, None if undetected.
+    """Return the state after points were reported as detected for track `detected`, or as undetected (None).
 
     Trains that lock the points are stopped if the detection of the points is lost. After a start, trains over the
-    points are stopped if the detected position is not the commanded one. Points that no train locks keep their detected
-    position.
+    points are stopped if the detected position is not the commanded one. Points that no train locks remain in their
+    detected position.
     """
     before = state.points[point]
     after = replace(before, detected=detected)
@@ -185,7 +185,7 @@ def reached(train: TrainInterval, station: int, layout: Layout) -> bool:
 
 
 def _taken(state: Interlocking, here: TrainInterval, layout: Layout, nearby: NearbyTrains) -> str | None:
-    """Return the obstacle between a train and the next station, or on its track there; None without obstacle."""
+    """Return the obstacle on a train's path to and through the next station; None if there is none."""
     direction, target = here.direction, here.station + here.direction
     track, section, ahead = 1 if direction > 0 else 2, min(here.station, target), layout.stations[target]
     end = layout.track_end_m(target, direction)
@@ -215,7 +215,7 @@ def barred(state: Interlocking, path: list[Piece], layout: Layout) -> tuple[str,
 def comes_the_other_way(other: TrainInterval, direction: int, section: int, layout: Layout) -> bool:
     """Return whether an opposing train has its route or interval between stations `section` and `section` + 1.
 
-    The zones of the points of both stations are not considered.
+    The points of both stations are not considered.
     """
     if other.direction == direction:
         return False
@@ -243,10 +243,10 @@ def under_interval(state: Interlocking, point: PointName, layout: Layout, nearby
 def due_commands(
     state: Interlocking, layout: Layout, stored: Interlocking, nearby: NearbyTrains | None = None
 ) -> tuple[Interlocking, dict[PointName, int]]:
-    """Return the state after all due commands to points, and the commanded track of each set of points.
+    """Return the state after all due commands to points, and the commanded track by set of points.
 
-    A command is due only if it is stored. Points whose detection is awaited, or that an interval includes, get no
-    command.
+    A command is due only if it is stored. Points get no command while their detection is awaited or an interval
+    includes them.
     """
     due = {
         name: point
@@ -266,7 +266,7 @@ def due_commands(
 
 
 def release_points(state: Interlocking, now_s: float, layout: Layout, *, limits: InterlockingLimits) -> Interlocking:
-    """Release points `InterlockingLimits.release_s` after a safe rear end has left them; return the new state."""
+    """Return the state with points released `InterlockingLimits.release_s` after a train's safe rear end has passed."""
     points: dict[PointName, PointState] = {}
     for name, point in state.points.items():
         if not point.locked:

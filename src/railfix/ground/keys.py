@@ -93,7 +93,7 @@ def ending_sentence(name: str, ends: datetime) -> str:
 
 
 def list_ending(folder: Path, name: str, *, now: datetime | None = None) -> list[str]:
-    """Return one sentence per certificate of `name` or the authority that expires within `WARNING_DAYS`."""
+    """Return a sentence for each certificate (of `name`, of the authority) that expires within `WARNING_DAYS`."""
     limit = (now or datetime.now(UTC)) + timedelta(days=WARNING_DAYS)
     found = []
     for file in (f"{name}.pem", "authority.pem"):
@@ -134,7 +134,7 @@ def renew_keys(folder: Path, trains: Iterable[int], *, valid_days: int = VALID_D
 
     The previous certificates stay valid until they expire, so that each end can change to the new files when it next
     starts or connects. The authority is renewed as well if its certificate would expire before the new certificates. In
-    this case, ``authority.pem`` has the old and the new certificate, and must be given to every end before the new
+    this case, ``authority.pem`` contains the old and the new certificate, and must be given to every end before the new
     files. Raise InputFileError or OutputError as `write_keys` does.
     """
     signing, issuer = _read_authority(folder)
@@ -207,7 +207,7 @@ def _write(folder: Path, parts: dict[str, bytes], *, replace: bool) -> list[Path
     """Write each file and return the paths; key files can be read only by their owner.
 
     With `replace`, existing files are replaced once all new files are complete. Raise OutputError if a file cannot be
-    written, or exists already without `replace`.
+    written or, without `replace`, exists already.
     """
     written = []
     try:

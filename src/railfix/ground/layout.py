@@ -119,8 +119,8 @@ class Layout(Settings):
 
         Gradients are rounded to the downhill side in running direction.
 
-        If there are more than `MOST_PARTS` gradients, only the nearest are returned, all with the steepest descent of
-        the range.
+        If there are more than `MOST_PARTS`, only the first in running direction are returned, all with the steepest
+        descent of the whole range.
         """
         ends = [gradient.from_m for gradient in self.gradients[1:]] + [math.inf] * bool(self.gradients)
         parts = [

@@ -24,12 +24,12 @@ from railfix.ground.frames import Echo, Frame, FrameKind, FrameReceiver, Receive
 from railfix.ground.keys import WARNING_DAYS, Revoked, ending_sentence, list_ending, read_revoked
 from railfix.ground.quic import WAIT_S, LinkProtocol, configuration, connection, listen
 
-#: Number of stored results: one hour at ten frames per second.
+#: Number of stored frame results of a link: one hour at ten frames per second.
 KEPT: Final = 36_000
 
 
 class LinkResult(NamedTuple):
-    """Result of a frame: time [s] and position [m] of sending, and round-trip time [s], NaN if not answered in time."""
+    """Result of a frame: time [s] and position [m] at sending, and round-trip time [s], NaN without a timely answer."""
 
     sent_s: float
     chainage_m: float
@@ -39,7 +39,8 @@ class LinkResult(NamedTuple):
 class LinkLimits(Settings):
     """Time-outs and switching rules of the two links between a train and the centre."""
 
-    #: Longest time from a frame to its echo; a later echo counts as a miss. A centre delays echoes by up to 0.2 s.
+    #: Longest time from the sending of a frame to its echo; a later echo counts as a miss. A centre delays echoes by up
+    #: to 0.2 s.
     answer_s: float = Field(default=1.0, gt=0)
     misses: int = Field(default=3, ge=1)  #: Number of consecutive misses after which the spare link is used.
     good: int = Field(default=10, ge=1)  #: Number of consecutive answers before the normal link is used again.
@@ -47,7 +48,7 @@ class LinkLimits(Settings):
     window: int = Field(default=60, ge=1)  #: Number of newest frames from which the response rate is computed.
     place_m: float = Field(default=100.0, gt=0)  #: Length of a cell of the coverage map.
     #: If no packet has arrived for this time after a frame was sent, the connection is opened again, so that trains
-    #: reconnect after a centre was killed. At most 10 s.
+    #: reconnect after a centre was killed.
     idle_s: float = Field(default=5.0, gt=0, le=10)
 
 
@@ -118,7 +119,7 @@ LinkMode = Literal["both", "spare"]  #: Whether both links carry the payload, or
 
 @dataclass(frozen=True, kw_only=True)
 class LinkChoice:
-    """Link in use, out of a normal link A and a spare link B."""
+    """Choice between the normal link A and the spare link B."""
 
     active: LinkName = "A"
     since_s: float = 0.0  #: Time of the last change between the links [s].
@@ -156,7 +157,7 @@ def coverage(meters: Iterable[LinkMeter]) -> dict[int, dict[int, tuple[int, int]
 
 
 def round_trips(meters: Iterable[LinkMeter]) -> tuple[Floats, Floats, Floats]:
-    """Return three values of each frame: time since the first frame [s], chainage [m], and round trip [s] or NaN."""
+    """Return time since the first frame [s], chainage [m] and round trip [s] of each frame; unknown values are NaN."""
     results = sorted(result for meter in meters for result in meter.results)
     table = np.array(results, dtype=np.float64).reshape(-1, 3)
     return table[:, 0] - table[:1, 0].sum(), table[:, 1], table[:, 2]
@@ -322,10 +323,10 @@ class TrainLinks:
 class CentreLinks:
     """The centre's end of the links, which listens at one address per bearer.
 
-    `received` is called with the train's number and the payload. By default, free ports are used; `addresses` has the
-    addresses in use, by bearer. Answers are delayed by up to `wait_s`, to be sent together with a payload.
-    `masquerades` is the number of connections that were rejected because of their certificate. `heard_s` has the
-    monotonic time of the last frame received, by train and bearer. `alarm` is a sentence if the list of revoked
+    `received` is called with the train's number and the payload. By default, free ports are used; `addresses` contains
+    the addresses in use, by bearer. Answers are delayed by up to `wait_s`, to be sent together with a payload.
+    `masquerades` is the number of connections that were rejected because of their certificate. `heard_s` contains the
+    monotonic time of the last received frame, by train and bearer. `alarm` is a sentence if the list of revoked
     certificates cannot be read, otherwise None.
     """
 

@@ -15,19 +15,19 @@ from railfix.ground.braking import BrakeLimits, Steps, Supervised, stopping_m, s
 from railfix.ground.links import LinkMode
 from railfix.ground.positions import Clock
 
-#: Backward movement of the safe front end that counts as rolling back [m]; it exceeds the errors of two positions.
+#: Backward movement of the safe front end that counts as rolling back [m]. Position errors are assumed to cause less.
 ROLLED_M: Final = 50.0
-#: Number of newest reports whose times of sending are stored.
+#: Number of newest reports for which the time of sending is stored.
 REMEMBERED: Final = 600
 REPORT_S: Final = 1.0  #: Time between two reports.
-#: Longest permitted time limit of authorities [s]; an authority that is older on arrival is rejected.
+#: Upper limit of `fresh_s` [s]. An authority is rejected if it answers a report older than this.
 LONGEST_FRESH_S: Final = 45.0
 
 
 class OnBoardLimits(BrakeLimits):
     """Limits of the on-board supervision."""
 
-    #: Time limit of authorities: the train brakes if the report that the newest authority answers was sent longer ago.
+    #: Largest age of the newest authority, counted from the sending of the report that the authority answers.
     fresh_s: float = option(
         "Largest age of the newest authority; the train brakes if the authority is older.",
         15.0,
@@ -36,8 +36,8 @@ class OnBoardLimits(BrakeLimits):
         gt=0,
         le=LONGEST_FRESH_S,
     )
-    #: Longest time for which a train without a new position is extrapolated from the last position, at the highest
-    #: speed of that position. After this time, the train brakes.
+    #: Longest time without a new position, after which the train brakes. Until then, the last position is extrapolated
+    #: at the train's highest possible speed.
     placeless_s: float = Field(default=5.0, ge=0)
     clock: Clock = option(
         "Report positions from a recording with the present time, at the recorded pace.", "live", name="--replay"
@@ -47,7 +47,7 @@ class OnBoardLimits(BrakeLimits):
 
 @dataclass(kw_only=True)
 class Motion:
-    """Newest position of a train: safe front and rear ends, highest speed, and time (None if unknown)."""
+    """Newest position of a train: safe front and rear ends, highest possible speed, and time if known."""
 
     front_m: float
     rear_m: float
@@ -59,9 +59,9 @@ class Motion:
 class OnBoard:
     """On-board supervision of a train by its movement authority.
 
-    The age of an authority is the time since the train sent the report that the authority answers, on the train's
-    monotonic clock. Delays on the links cannot make this age too small, and the clocks of train and centre need not be
-    synchronised.
+    The age of an authority is the time since the train sent the report that the authority answers, measured with the
+    train's monotonic clock. Delays on the links cannot make this age too small, and the clocks of train and centre need
+    not be synchronised.
     """
 
     direction: int
@@ -77,8 +77,8 @@ class OnBoard:
     stopped: bool = False  #: Whether the newest authority is an order to stop.
     order: BrakeOrder | None = None  #: Order to brake that the train obeys.
     authority: Authority | None = None  #: Newest authority.
-    #: Position at which the train's safe front end would stop if the train braked now: the farther of the last two such
-    #: positions. If None, the train accepts no shorter end.
+    #: Position at which the train's safe front end would stop if the train braked now; the farther of the last two
+    #: results. If None, the train accepts no shorter end.
     stops_at_m: float | None = None
     #: Time at which the newest answered report was sent; None before the first answer.
     answered_s: float | None = None
@@ -110,11 +110,11 @@ class OnBoard:
     ) -> None:
         """Store the train's safe ends and speed.
 
-        Whether the train can stop before a shorter end is decided by the farther of its last two stopping positions, so
-        that a single wrong position cannot cause the train to accept the shorter end.
+        The train accepts a shorter end only if the farther of its last two stopping positions is before this end, so
+        that a single wrong position cannot cause the acceptance.
 
         A train that has rolled back brakes until it gets a new authority, because earlier authorities do not cover its
-        new position. Without a position or a speed, the last position is extrapolated (`OnBoardLimits.placeless_s`).
+        new position. If position or speed is None, the last position is extrapolated.
         """
         before, self._place_m, self.stops_at_m = self._place_m, None, None
         if safe_front_m is None:
@@ -147,13 +147,13 @@ class OnBoard:
     def receive(self, authority: Authority) -> bool:
         """Process an authority; return whether it is accepted.
 
-        An authority must be newer than the last accepted authority, and have the train's direction. An authority that
-        answers a report sent before the last change of ends is rejected, even if its direction is the present one,
-        because it may have been granted two changes of ends ago. An authority that has lapsed in transit is rejected.
-        An order to brake is always accepted; a late order lasts until the next authority.
+        An authority must be newer than the last accepted authority, and apply to the train's direction. An authority
+        that answers a report sent before the last change of ends is rejected even if its direction is right, because it
+        may have been granted two changes of ends ago. An authority that has lapsed in transit is rejected. An order to
+        brake is always accepted; a late order applies until the next authority.
         """
         if isinstance(authority, BrakeOrder):
-            # an order may have a number below that of the authority, if the centre's database is an older copy
+            # an order may have a lower number than the authority if the centre's database is an older copy
             if self.order is None or authority.number >= self.order.number:
                 self.order = authority
             return True
@@ -178,7 +178,7 @@ class OnBoard:
     def _ends_order(self, authority: Authority) -> bool:
         """Return whether an authority ends the order to brake.
 
-        If not, only the time at which the answered report was sent is stored.
+        Otherwise, only the time at which the answered report was sent is updated.
         """
         assert self.order is not None
         if authority.number > self.order.number and not authority.stopped:
@@ -188,7 +188,7 @@ class OnBoard:
         return False
 
     def _answers(self, authority: Authority) -> bool:
-        """Return whether an authority answers a recent report, sent since the start and the last change of ends."""
+        """Return whether an authority answers a recent report, sent after the start and the last change of ends."""
         if authority.session != self.session or authority.report <= self.before_turn:
             return False
         if len(self._sent) == REMEMBERED and authority.report < next(iter(self._sent)):
@@ -201,14 +201,15 @@ class OnBoard:
         return not self._granted
 
     def _may_take(self, authority: Authority, *, agrees: bool) -> bool:
-        """Return whether an authority may be accepted; a shorter end requires `agrees` or an earlier authority.
+        """Return whether an authority may be accepted.
 
-        A train without an earlier authority since its start brakes until it can accept the shorter end.
+        A shorter end requires `agrees` (the train can stop before it) or an earlier authority. Without an earlier
+        authority, the train brakes until it can accept the shorter end.
         """
         return not authority.shortens or agrees or self._granted
 
     def acknowledgement(self) -> dict[str, int]:
-        """Return the fields of a report that name the newest authority and the order to brake, where received."""
+        """Return the fields of a report that acknowledge the newest authority and the order to brake, if received."""
         order = {} if self.order is None else {"brake_order": self.order.number}
         if self.number < 0:
             return order
@@ -224,8 +225,8 @@ class OnBoard:
         parts = () if self.authority is None else self.authority.gradients
         if self.direction > 0:
             return Steps([c / 100.0 for c, _ in parts], [p / 1000.0 for _, p in parts])
-        # toward falling chainage, a gradient begins at the chainage of the next gradient and ends at its own chainage,
-        # beyond which the previous gradient applies; the line is level below the first chainage
+        # in the direction of falling chainage, a gradient begins at the chainage of the next gradient and ends at its
+        # own chainage; the line is level below the first chainage
         ends = [-c / 100.0 for c, _ in parts[::-1]]
         return Steps([-math.inf, *ends], [*(-p / 1000.0 for _, p in parts[::-1]), 0.0])
 
@@ -259,7 +260,7 @@ class OnBoard:
         return motion.speed_mps * max(now_s - motion.at_s, 0.0)
 
     def brake_reason(self, now_s: float) -> str | None:
-        """Return the reason why the train brakes, None if the train need not brake."""
+        """Return the reason why the train brakes, or None if it need not brake."""
         if self.order is not None:
             return f"ordered to stop: {self.order.reason}" if self.order.reason else "ordered to stop"
         if self.stopped:

@@ -24,7 +24,7 @@ Clock = Literal["live", "replay"]
 async def read_positions(
     lines: AsyncIterator[str], *, rejected: Callable[[str], None], clock: Clock = "live"
 ) -> AsyncIterator[TrainMessage]:
-    """Yield the position messages that lines contain; for each other line, `rejected` is called with a message.
+    """Yield the position messages decoded from lines; call `rejected` with the reason for each invalid line.
 
     With the clock "replay", messages are delayed to the pace of the recording, and their times are replaced by the
     present time, so that the centre accepts the positions as new.
@@ -51,9 +51,9 @@ async def read_positions(
 
 
 async def standard_input() -> AsyncIterator[str]:
-    """Yield lines of the standard input as they arrive; the wait for a line does not delay the end of the program.
+    """Yield lines of the standard input as they arrive; the program can end while it waits for a line.
 
-    Of a line longer than `LONGEST_LINE`, only the beginning is yielded, which is not a valid message.
+    Lines are cut at `LONGEST_LINE`; a cut line is not a valid message.
     """
     kind = os.fstat(sys.stdin.fileno()).st_mode
     if not (stat.S_ISFIFO(kind) or stat.S_ISSOCK(kind) or sys.stdin.isatty()):  # reading a file does not block

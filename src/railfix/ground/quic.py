@@ -1,8 +1,8 @@
 """QUIC connections with datagrams, in which both ends are authenticated by certificates.
 
-In aioquic, a client certificate can be requested, and acknowledgements can be delayed, only by private attributes
-(`_request_client_certificate`, `_peer_certificate`, `_ack_delay`, `_spaces`, `_loss`, `_datagrams_pending`), which no
-other module uses.
+Only this module uses private attributes of aioquic (`_request_client_certificate`, `_peer_certificate`, `_ack_delay`,
+`_spaces`, `_loss`, `_datagrams_pending`). They are required to request a client certificate, and to delay
+acknowledgements.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ MOST_OF_PEER: Final = 16
 MOST_HANDSHAKES: Final = 64
 #: Time after which a handshake in progress is ended if another handshake waits [s]; by then, the peer has given up.
 HANDSHAKE_S: Final = 5.0
-#: Time in which a peer begins the handshake after a Retry [s].
+#: Assumed time within which a peer begins its handshake after a Retry [s].
 INVITED_S: Final = 0.25
 #: Interval at which waiting first packets are checked [s].
 ASKING_S: Final = 0.01
@@ -123,7 +123,7 @@ class Handshakes:
 class LinkProtocol(QuicConnectionProtocol):
     """One end of a connection that carries datagrams.
 
-    `peer` has the certificate of the other end, None before the certificate is verified.
+    `peer` is the verified certificate of the other end, None before the verification.
     """
 
     def __init__(
@@ -143,8 +143,9 @@ class LinkProtocol(QuicConnectionProtocol):
         self._received = received
         self._rejected = rejected
         self._wait_s = wait_s
-        self.patience: Callable[[], None] | None = None  #: Called once, at the first packet from the other end.
-        self.unanswered_s: float | None = None  #: Time of the first message sent since the newest packet [s].
+        #: Function called once, at the first packet from the other end.
+        self.patience: Callable[[], None] | None = None
+        self.unanswered_s: float | None = None  #: Time of the first message sent since the last received packet [s].
         self._answers: list[Callable[[], bytes]] = []
         self._waiting: asyncio.TimerHandle | None = None
         if not quic.configuration.is_client:
@@ -205,7 +206,7 @@ class LinkProtocol(QuicConnectionProtocol):
             self._waiting = self._loop.call_later(self._wait_s, self.transmit)
 
     def answer(self, made: Callable[[], bytes]) -> None:
-        """Send the bytes that `made` returns in the next packet; `made` is called when that packet is sent."""
+        """Send the result of `made` with the next packet; `made` is called when that packet is sent."""
         self._answers.append(made)
 
     def transmit(self) -> None:

@@ -25,16 +25,16 @@ LENGTH_ROUNDING_M: Final = 0.02
 #: Largest reported speed of a train at standstill, and largest backward speed that does not count as running backward
 #: [m/s].
 STANDING_MPS: Final = 0.5
-SPEED_ERROR_MPS: Final = 1.0  #: Largest error of a reported speed.
+SPEED_ERROR_MPS: Final = 1.0  #: Largest assumed error of a reported speed.
 #: Largest sum of the over-reading and under-reading amounts of an accepted report [m].
 WIDEST_M: Final = 1000.0
-#: Lower bound of the time between two positions that is assumed when an interval is extended [s]. It also covers the
-#: largest age of a position at sending.
+#: Shortest time between two positions that is assumed when an interval is extended [s]. It also covers the largest age
+#: of a position at sending.
 INSTANT_S: Final = 5.0
 
 
 def is_placed(message: TrainMessage) -> bool:
-    """Return whether a report has a position with both bounds, and it is known which end of the train is the front."""
+    """Return whether a report has a position with both bounds, and states which end of the train is the front."""
     known = None not in (message.chainage_cm, message.over_cm, message.under_cm)
     placed = message.status in (MessageStatus.POSITION, MessageStatus.COASTING)
     return known and placed and message.facing != 0 and Unknown.FRONT_END not in message.unknown
@@ -57,16 +57,16 @@ def confirms_rear(known: TrainInterval, message: TrainMessage) -> bool:
 
 @dataclass(frozen=True, kw_only=True)
 class PlacedReport:
-    """Report with a position, and what the centre knows about the train."""
+    """Report with a position, and the centre's data on the train."""
 
     known: TrainInterval
     message: TrainMessage
     layout: Layout
     limits: InterlockingLimits
-    granted: int  #: Number of the authorities that were sent last.
+    granted: int  #: Highest number of the authorities sent so far.
     skipped: tuple[int, int]  #: `Interlocking.skipped`.
-    #: Longest time since the previous position [s]: negative if the time of the new position is before that of the
-    #: previous one, None if unknown, as at the first report.
+    #: Longest time since the previous position [s]. It is negative if the new position is older than the previous
+    #: position, and None if unknown, as at the first report.
     elapsed_s: float | None
 
     @property
@@ -101,7 +101,7 @@ class PlacedReport:
 
     @property
     def held_m(self) -> float | None:
-        """End of the authority that the report names, limited to the line [m]; None if the report names none."""
+        """End of the authority that the report names, within the line [m]; None if the report names no authority."""
         end_cm, stations = self.message.authority_end_cm, self.layout.stations
         return None if end_cm is None else min(max(end_cm / 100.0, stations[0].begin_m), stations[-1].end_m)
 
@@ -136,7 +136,7 @@ def off_line(report: PlacedReport) -> str | None:
 
 
 def moving_standstill(report: PlacedReport) -> str | None:
-    """Return a contradiction if a standstill is reported with a speed, otherwise None."""
+    """Return a contradiction if a standstill is reported with a speed above `STANDING_MPS`, otherwise None."""
     moving = report.message.standstill and not stands(report.message)
     return f"the report states standstill and a speed of {report.speed_mps:.1f} m/s" if moving else None
 
@@ -266,7 +266,7 @@ def covered_m(report: PlacedReport) -> tuple[float, float]:
 
 
 def _noted(report: PlacedReport, **interval: Any) -> TrainInterval:
-    """Return the train's record with the data of a report, which may be contradicted, and the changes in `interval`."""
+    """Return the train's record with the data of a report (possibly contradicted) and the changes in `interval`."""
     message = report.message
     low, high = sorted((report.rear_m, report.ahead_m))
     noted: dict[str, Any] = {
@@ -312,7 +312,7 @@ def report_received(
     A change of ends is accepted only at standstill inside the train's station; afterwards the interval still includes
     the earlier position. A report that contradicts the train's record stops the train, and can only extend the
     interval. Reports without a position, and reports older than the newest, have no effect. `elapsed_s` is the longest
-    time since the previous position according to the centre's clock, where known.
+    time since the previous position according to the centre's clock, or None.
     """
     before = state.trains.get(message.train)
     if before is None or not is_placed(message) or not is_newer(before, message):

@@ -47,7 +47,7 @@ ENDING_S = 3.0
 #: Thresholds of the garbage collector, chosen so that full collections are rare; a full collection takes 0.3 s with a
 #: thousand connections.
 COLLECTION = 10_000, 20, 50
-#: Name of the document with the stations and trains to which the database belongs.
+#: Name of the stored document that lists the stations and trains of the database.
 _BELONGS_TO = "stations and trains"
 
 
@@ -82,7 +82,7 @@ class TriangleInputs(Settings):
 
     sources: tuple[str, str, str]  #: Streams of the three receivers, as in ``railfix live``.
     points: tuple[Place, Place, Place]  #: Latitude [deg], longitude [deg] and height [m] of the three known points.
-    nav: tuple[Path, ...] = ()  #: Navigation files; records from the streams are added.
+    nav: tuple[Path, ...] = ()  #: Navigation files; navigation data from the streams are added.
     limits: TriangleLimits = TriangleLimits()
 
     def points_ecef_m(self) -> Floats:
@@ -94,7 +94,7 @@ class CentreFile(Settings):
     """Configuration file of a centre; paths in the file are relative to the folder of the file."""
 
     keys: Path  #: Folder with ``authority.pem``, ``centre.pem`` and ``centre.key``, written by ``railfix ground keys``.
-    listen: dict[LinkName, Address]  #: Address of each bearer.
+    listen: dict[LinkName, Address]  #: Address at which the centre listens on each bearer.
     stations: tuple[LoopStation, ...] = ()  #: Stations of the line, unless `network` is given.
     #: Map files of a network of tracks that is one single line with passing loops (`railfix.ground.layout`).
     network: tuple[Path, ...] = ()
@@ -177,7 +177,7 @@ class CentreFile(Settings):
         ]
 
     def curves(self) -> dict[int, ReferenceCurve]:
-        """Return the reference run curve of each direction; a curve stops in the middle of each station."""
+        """Return the reference run curves by direction, with stops in the middle of each station."""
         stops = np.array([0.5 * (station.begin_m + station.end_m) for station in self.stations])
         return {
             1: ReferenceCurve.between_stations(stops, speed_mps=self.speed_mps),
@@ -200,10 +200,10 @@ async def run_centre(
     Return whether SIGTERM ended the centre, and counts of reports, routes and rejected frames.
 
     `page` is the host and port of the page, where port 0 selects a free port. At addresses other than loopback, the
-    page is served over TLS with the centre's certificate. Orders require `password`, or one of the personal passwords
-    in `people`, by name. `orders` is a separate address for orders, by default the page's address. `announce` is called
-    with each address once trains can connect. Raise InputFileError if the file, a key or the database cannot be read.
-    Raise SettingsError if a setting is wrong, or an address is not available.
+    page is served over TLS with the centre's certificate. Orders require `password`, or a personal password from
+    `people` (by name of the person). `orders` is a separate address for orders, by default the page's address.
+    `announce` is called with each address once trains can connect. Raise InputFileError if the file, a key or the
+    database cannot be read. Raise SettingsError if a setting is wrong, or an address is not available.
     """
     settings = load_settings(CentreFile, path, what="a file of a centre").with_stations(path.parent)
     keys = path.parent / settings.keys
@@ -316,7 +316,7 @@ def _centre(
 
 
 def _stored_points(store: Store) -> dict[PointName, int]:
-    """Return the last detected, or else commanded, track of each set of simulated points from the database."""
+    """Return the stored track of each set of simulated points: the detected track or, if None, the commanded track."""
     texts = store.documents(HEAD)
     points = from_documents(texts).points if texts else {}
     return {name: point.detected or point.wanted for name, point in points.items()}
@@ -342,7 +342,7 @@ def _heard(control: ControlCentre, links: CentreLinks) -> list[dict[str, Any]]:
 async def _work(control: ControlCentre, points: SimulatedPoints) -> None:
     """Run a step of the centre every `STEP_S`.
 
-    Steps take at most half of the time, because the links receive frames in the same event loop.
+    Steps take at most half of the time, so that the links can receive frames in the same event loop.
     """
     loop = asyncio.get_running_loop()
     due = loop.time()
@@ -357,7 +357,7 @@ async def _work(control: ControlCentre, points: SimulatedPoints) -> None:
 
 
 async def _judge(control: ControlCentre, settings: CentreFile, path: Path) -> None:
-    """Monitor satellite positioning with the triangle's streams; if the streams end, late fixes stop the trains."""
+    """Monitor satellite positioning with the triangle's streams; trains are stopped after the streams end."""
     if (triangle := settings.triangle) is None:
         return
     try:
@@ -405,7 +405,7 @@ def _is_loopback(host: str) -> bool:
 def read_passwords(path: Path) -> tuple[str, dict[str, str]]:
     """Return the password in the first line of a file, and personal passwords in the other lines, ``NAME PASSWORD``.
 
-    Raise InputFileError if the file cannot be read, is empty, has another form, or can be read by others than its
+    Raise InputFileError if the file cannot be read, is empty, has another form, or can be read by users other than its
     owner.
     """
     try:

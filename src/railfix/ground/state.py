@@ -58,7 +58,7 @@ class TrainInterval:
     #: Safe rear end of the newest report; the interval begins there once the next report confirms it. None if the
     #: newest report does not confirm the train's integrity and length.
     claimed_m: float | None = None
-    line: int | None = None  #: Number of the line that the train's reports state; None before the first report.
+    line: int | None = None  #: Line number in the train's reports; None before the first report.
     #: Time of the newest position by the train's clock; None before the first report since the train's unit was
     #: started.
     measured_ns: int | None = None
@@ -66,13 +66,13 @@ class TrainInterval:
     #: Ends of the train according to the newest report with a position, even if that report contradicts the record;
     #: lower chainage first [m].
     reported_m: tuple[float, float] | None = None
-    contradiction: str | None = None  #: Contradiction between that report and the record, None without one.
+    contradiction: str | None = None  #: Contradiction between the newest report and the record, or None.
     held_end_m: float | None = None  #: End of the train's authority according to its newest report.
-    #: Number of the newest authority, sent or named by a report, by which the train may run. None before the first
-    #: authority. Also None after a report that names an order to brake with this or a later number, because no
-    #: authority in transit can end that order.
+    #: Number of the newest authority that may permit the train to run, sent by the centre or acknowledged by a report.
+    #: None before the first authority. Also None after a report that acknowledges an order to brake with this or a
+    #: higher number, because no authority in transit can end that order.
     runs_by: int | None = None
-    stop: str | None = None  #: Reason why the train is stopped, None if it is not; kept until a release by hand.
+    stop: str | None = None  #: Reason why the train is stopped, or None. The reason is kept until a release by hand.
     asked_m: float | None = None  #: Shorter end of the authority that the train is requested to accept.
     asked_number: int = 0  #: Number of the first authority that requests the shorter end.
     held: bool = False  #: Whether the train has returned a route; the next route is then set by hand.
@@ -107,11 +107,11 @@ class TrainInterval:
         return self.span_m[0] < high_m and low_m < self.span_m[1]
 
     def has_passed(self, low_m: float, high_m: float) -> bool:
-        """Return whether the rear end has left a range of chainages behind, in running direction."""
+        """Return whether the rear end has passed a range of chainages in running direction."""
         return self.rear_m >= high_m if self.direction > 0 else self.rear_m <= low_m
 
     def outside_m(self) -> float:
-        """Return the distance of the newest reported position from the interval [m], 0 if it may be inside."""
+        """Return the distance of the newest reported position from the interval [m], 0 if the train may be inside."""
         if self.reported_m is None:
             return 0.0
         front = max(self.direction * end for end in self.reported_m)
@@ -132,8 +132,8 @@ class PointState:
     detected: int | None = 1  #: Detected track; None while the points move, or before the field has answered.
     #: Whether the command to move to `wanted` has been given, or is not needed.
     commanded: bool = True
-    #: Trains that lock the points, each with the time at which its lock ends [s]; None until the train's rear end has
-    #: passed.
+    #: Trains that lock the points, each with the time at which its lock ends [s]. The time is None until the train's
+    #: rear end has passed.
     locked: Mapping[int, float | None] = field(default_factory=dict)
 
     @property
@@ -163,11 +163,11 @@ class Interlocking:
     trains: Mapping[int, TrainInterval]
     points: Mapping[PointName, PointState]
     stopped: bool = False  #: Whether satellite positioning is suspended: no authority is extended, and no route is set.
-    granted: int = 0  #: Number of the authorities that were sent last.
-    #: Last authority number stored in the database at this start, and first number issued after it. Authorities with
-    #: numbers between these two were issued from a newer state than the stored state.
+    granted: int = 0  #: Highest number of the authorities sent so far.
+    #: Last authority number in the database at this start, and first number issued since. Authorities with numbers
+    #: between these two were issued by a centre with a newer state than the stored state.
     skipped: tuple[int, int] = (0, 0)
-    #: Sections (`Layout.sections`) into which no authority reaches, each with the reason
+    #: Sections (`Layout.sections`) into which no authority may reach, each with the reason
     #: (`railfix.ground.stops.CLOSED`, `OCCUPIED` or `UNKNOWN`).
     bars: frozenset[tuple[str, str]] = frozenset()
     restrictions: Mapping[str, Restriction] = field(default_factory=dict)  #: Speed restrictions by name.

@@ -43,8 +43,8 @@ def overlaps_stopped(
 
     Intervals can come to overlap because the bounds of trains at rest may grow.
 
-    `checked` holds the trains as they were at an earlier call; two trains that have not changed since that call are not
-    compared with each other again.
+    `checked` contains the trains as they were at an earlier call. Two trains that have not changed since that call are
+    not compared again.
     """
     nearby, checked = nearby or NearbyTrains(state, layout), checked or {}
     pairs = set()
@@ -82,8 +82,8 @@ def release_train(state: Interlocking, train: int, layout: Layout) -> tuple[Inte
     """Release the stop of one train by hand; return the new state, and the reason if the release is refused.
 
     Points under the train's interval are locked for the train again, because a train that has rolled back may have
-    released these points. The next report determines the line of the train. The route is shortened to the farthest
-    station on the route that the train's front end has reached.
+    released these points. The next report determines the line number of the train. The route is shortened to the
+    farthest station on the route that the train's front end has reached.
     """
     known = state.trains.get(train)
     if known is None or known.stop is None:

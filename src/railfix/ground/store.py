@@ -169,7 +169,7 @@ class Store:
         self._connection.execute(LOG.delete().where(LOG.c.number <= newest - self._most_lines))
 
     def note(self, time_ns: int, text: str, *, train: int | None = None) -> None:
-        """Add a line to the log, to be committed with the next `save` or at the end."""
+        """Add a line to the log; it is committed by the next `save` or by `close`."""
         self._notes.append({"time_ns": time_ns, "train": train, "text": text})
 
     def records(self) -> dict[int, TrainRecord]:
@@ -201,7 +201,7 @@ class Store:
             return {row.name: row.text for row in self._connection.execute(named)}
 
     def log(self, *, last: int = 100) -> list[tuple[int, int | None, str]]:
-        """Return the newest lines of the log that are committed, oldest first: time [ns], train, text."""
+        """Return the newest committed lines of the log, oldest first: time [ns], train, text."""
         query = sql.select(LOG).order_by(LOG.c.number.desc()).limit(last)
         with self._connection.begin():
             rows = self._connection.execute(query).all()
@@ -217,7 +217,7 @@ class Store:
 
 
 def _time_outs(url: str) -> dict[str, Any]:
-    """Return a connection's time-outs for connecting, for a statement, and for an interrupted network."""
+    """Return a connection's time-outs for connecting, for statements, and for network interruptions."""
     if url.startswith("postgresql"):
         return {"connect_timeout": 2, "tcp_user_timeout": 5000, "options": "-c statement_timeout=5000"}
     if url.startswith(("mysql", "mariadb")):

@@ -37,14 +37,14 @@ from railfix.ground.stops import (
 )
 from railfix.io.train_message import TrainMessage
 
-#: Distance to the end of its track within which a train gets the next route [m].
+#: Distance from the end of a train's track within which the train gets the next route [m].
 ROUTE_AHEAD_M = 700.0
 #: Longest time between two authorities to a train [s]. A train also gets an authority after each report, and when its
 #: stop begins or ends.
 AUTHORITY_S = 1.0
 #: Smallest number of authority numbers that are skipped at a restart.
 SKIPPED: Final = 1 << 20
-#: Time after the sending of the answered report when an authority has certainly lapsed on board [s]; above
+#: Time after which an authority has lapsed on board, counted from the report that it answers [s]; above
 #: `LONGEST_FRESH_S`.
 LAPSED_S: Final = 60.0
 #: Largest relative drift between the clocks of a train and the centre.
@@ -57,8 +57,7 @@ class Supervision:
 
     layout: Layout
     state: Interlocking
-    #: Function that is called with the points to be moved and the track to which they shall lead; the detection that
-    #: follows is passed to `set_detected`.
+    #: Function that commands a set of points to a track. The detection that follows must be passed to `set_detected`.
     command: Callable[[PointName, int], None] = lambda *_: None
 
     routes: Literal["automatic", "by hand"] = "automatic"
@@ -105,7 +104,7 @@ class Supervision:
                 self.awaited.discard(number)
             elapsed_s, clock, is_new = self._read_clock(message, before, now_s)
             self.state = report_received(self.state, message, self.layout, limits=self.limits, elapsed_s=elapsed_s)
-            # with the delay of a contradicted report, longer distances would be accepted later
+            # the clock delay from a contradicted report could make the centre accept too long distances later
             if is_new or self.state.trains[number].contradiction is None:
                 self._clocks[number] = clock
             self.state = answer_received(self.state, message)
@@ -129,12 +128,12 @@ class Supervision:
     def _read_clock(
         self, message: TrainMessage, record: TrainRecord, now_s: float
     ) -> tuple[float | None, tuple[float, float], bool]:
-        """Return the longest time since the train's previous position, and the delay of the train's clock [s].
+        """Return the longest time since the train's previous position [s], its clock's delay, and whether the clock is
+        new.
 
-        The time, None if unknown, is computed with the least delay of earlier reports. After a restart on board, the
-        train's clock is new, and only the centre's clock is used. The delay is returned with the time at which it was
-        observed. The third value is True for a new clock, and for a clock that was set back: with the delays from
-        before, the time since later positions would be too long.
+        The time is None if unknown. It is computed with the least delay of earlier reports, or after a restart on board
+        with the centre's clock alone. The delay [s] is returned with the time at which it was observed. A clock that
+        was set back counts as new, because its earlier delays would make the time since later positions too long.
         """
         number = message.train
         known, tolerance_s = self.state.trains[number], self.centre.clock_s
@@ -174,12 +173,12 @@ class Supervision:
     def begin_again(self, now_s: float, *, wall_us: int) -> tuple[PointName, ...]:
         """Begin with a stored state, which may be an older copy; return the points whose detection must be requested.
 
-        No authority is extended until every train has sent a report that names an order of this start. This report also
-        states any authority that the database does not contain, and the train no longer accepts late authorities of the
-        earlier process. The stored detection of points is dropped.
+        No authority is extended until every train has acknowledged an authority or an order to brake of this start. The
+        acknowledging report also states the end of the train's authority, which the database may not contain. The train
+        then rejects late authorities of the earlier process. The stored detection of points is dropped.
 
-        Authority numbers begin at the microseconds `wall_us` of the computer's clock, so that they exceed the numbers
-        of every earlier start. If the computer's clock was set back, the numbers still exceed those in the database.
+        Authority numbers begin at the time of the computer's clock `wall_us` [us], so that they exceed the numbers of
+        every earlier start. If the computer's clock was set back, the numbers still exceed those in the database.
         """
         self.awaited, self.begun_s, last = set(self.state.trains), now_s, self.state.granted
         first = max(last + SKIPPED, wall_us)
@@ -208,8 +207,8 @@ class Supervision:
     def set_route(self, train: int, **step: Any) -> str | None:
         """Set a route to the next station; return the reason for a refusal.
 
-        The arguments `nearby` and `stopped` in `step` are passed to `route_requested`. The points of the route move
-        once `command_points` is called.
+        `step` contains the arguments `nearby` and `stopped` of `route_requested`. The points move after
+        `command_points` is called.
         """
         if train not in self.state.trains:
             return f"no such train: {train}"
@@ -250,7 +249,7 @@ class Supervision:
     def watch(self, now_s: float) -> list[BrakeOrder]:
         """Find trains that have to stop, and return the orders to brake to be sent; no commit is required.
 
-        An order is repeated every `AUTHORITY_S` until a report of the train names it.
+        An order is repeated every `AUTHORITY_S` until a report of the train acknowledges it.
         """
         for section, at_s in self.answered_s.items():
             if now_s - at_s > self.limits.detection_s and self.detected[section] is not None:
@@ -364,7 +363,7 @@ class Supervision:
 
 
 def is_obeyed(message: TrainMessage, number: int) -> bool:
-    """Return whether a report names the order to brake with a given number, or a later order."""
+    """Return whether a report acknowledges the order to brake with a given number, or a later order."""
     return (message.brake_order or -1) >= number
 
 

@@ -57,7 +57,7 @@ class SimulatedTrain:
         return self.front_m - self.direction * self.length_m
 
     def at_rest(self) -> TrainInterval:
-        """Return the interval of the train at rest in its only station."""
+        """Return the interval of the train, which must be at rest within one station."""
         ((station, track),) = self.tracks.items()
         return standing_train(
             self.number,
@@ -70,7 +70,7 @@ class SimulatedTrain:
         )
 
     def message(self, now_s: float) -> TrainMessage:
-        """Return the position message at a time [s], without a position before `blind_until_s`."""
+        """Return the position message at a time [s]; before `blind_until_s`, it contains no position."""
         self.sequence += 1
         self.on_board.note_report(self.sequence, now_s)
         time = 1_400_000_000_000_000_000 + round(now_s * 1e9)
@@ -125,7 +125,7 @@ class SimulatedTrain:
 class Traffic:
     """Traffic on a line: the trains and points, and the centre that supervises them.
 
-    Subclasses implement `send_report` and `exchange`, which transmit the messages.
+    Subclasses implement `send_report` and `exchange`, which transmit messages between the trains and the centre.
     """
 
     trains: dict[int, SimulatedTrain]
@@ -179,7 +179,7 @@ class Traffic:
         self.trains[authority.train].on_board.receive(authority)
 
     def command(self, name: PointName, track: int) -> None:
-        """Begin to move points; their new position is detected after some seconds."""
+        """Begin to move a set of points; its new position is detected after some seconds."""
         self.moving[name] = self.now_s + self.random.uniform(3.0, 7.0), track
         self.centre.set_detected(name, None)
         low, high = self.layout.zone_m(name)

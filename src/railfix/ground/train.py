@@ -20,7 +20,7 @@ from railfix.io.train_message import MessageError, TrainMessage, encode
 
 #: Interval between checks of the age of the authority and of the braking curve [s].
 LOOK_S = 0.1
-#: Longest time for which the unit waits for the answer to the last report after the last position [s].
+#: Longest wait for the answer to the last report, once there are no more positions [s].
 ANSWER_S: Final = 5.0
 #: Largest age of the file in which the integrity device states that the train is complete [s].
 INTEGRITY_S = 2.0
@@ -37,15 +37,15 @@ async def run_train(
     integrity: Path | None = None,
     for_s: float | None = None,
 ) -> tuple[int, int]:
-    """Send the newest position every second, and write authorities and changes of braking as lines of JSON.
+    """Send the newest position every second, and write received authorities and changes of braking as JSON lines.
 
-    The function returns the numbers of reports sent and of authorities received. After the last position, the function
-    ends when the last report is answered, or after `ANSWER_S`.
+    The function returns the numbers of sent reports and of received authorities. After the last position, it ends when
+    the last report is answered, or after `ANSWER_S`.
 
-    The folder `keys` has ``train-N.pem``, ``train-N.key`` and ``authority.pem``. The positions are messages as
-    `railfix.io.train_message.to_json` writes them, by default from the standard input; other lines are reported as
-    rejected (`railfix.ground.positions`). `integrity` is a file of the train's integrity device; if it is given,
-    `is_complete` determines whether the train is reported as complete. Raise InputFileError if a key is missing.
+    The folder `keys` contains ``train-N.pem``, ``train-N.key`` and ``authority.pem``. `lines` are position messages as
+    `railfix.io.train_message.to_json` writes them, by default lines of the standard input. Other lines are reported as
+    rejected. `integrity` is a file of the train's integrity device; if it is given, `is_complete` determines whether
+    the train is reported as complete. Raise InputFileError if a key is missing.
     """
     check_keys(keys, f"train-{train}")
     limits = limits or OnBoardLimits()
@@ -170,7 +170,7 @@ class _Desk:
             self._line(**authority.model_dump(), age_s=round(self._on_board.age_s(now), 3), **self._speeds(now))
 
     def _speeds(self, now_s: float) -> dict[str, float]:
-        """Return the permitted speed, its target, and the release speed; nothing before the first position."""
+        """Return the permitted speed, its target, and the release speed; empty before the first position."""
         assert self._on_board is not None
         if (found := self._on_board.supervised(now_s)) is None:
             return {}

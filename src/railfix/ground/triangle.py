@@ -3,8 +3,8 @@
 In P3, each fix must lie inside a circle of allowable error around its known point. In addition, the vectors between
 neighbouring fixes (distance and bearing) are compared with the vectors between the points. P3 treats a fix inside its
 circle as the point itself, so that a drift inside the circle cannot be detected. Here, the vectors are computed between
-raw fixes. Errors common to the three receivers cancel in these vectors; the limit of the vectors can therefore be far
-below the radius, and a drift inside the circle is detected.
+raw fixes. Errors common to the three receivers cancel in these vectors. The limit for the vectors can therefore be far
+below the radius, so that a drift inside the circle is detected.
 
 The monitor is a pure state machine: `advance` takes the state and one sample, and returns the new state and the orders
 to be sent. Once satellite positioning has been suspended, trains remain stopped until a release by hand.
@@ -46,7 +46,7 @@ class TriangleVerdict(IntEnum):
     SATELLITES_OR_JAMMING = 3
     #: The fixes coincide, as after one false signal for all three receivers.
     SPOOFING = 4
-    #: Any other combination: the ground side cannot decide.
+    #: Any other combination: the ground side cannot determine the cause.
     GROUND_LOST = 5
     #: A fix is absent.
     MONITOR_LOST = 6
@@ -228,8 +228,8 @@ _SETTLE_S: Final = 10.0
 class MonitorLimits(Settings):
     """Times of the monitor."""
 
-    #: Time after which a set of three fixes is late; the sum of this time and the period of the fixes must not exceed
-    #: the time to alert of 6 s.
+    #: Time since the last three fixes after which the next three are late. The sum of this time and the period of the
+    #: fixes must not exceed the time to alert of 6 s.
     late_s: float = option("Time after which three fixes are late.", 3.0, name="--late", metavar="S", gt=0, le=5.0)
     healthy_s: float = Field(default=300.0, gt=0)  #: Time of uninterrupted healthy fixes before a stop can be released.
 
@@ -358,9 +358,9 @@ class Monitor:
     def judge(self, fixes: StationFixes, now_s: float | None = None) -> MonitoredLog:
         """Process fixes at a clock time, by default at their time tags; return the verdicts and the orders to be sent.
 
-        Trains are stopped if fixes are late after the previous fixes, in logs as well as in streams. The cause given
-        with each order is the cause of the stop after all these fixes, because later fixes may make the cause more
-        exact. Raise SettingsError if the sides of the triangle are too short for the limits.
+        Trains are stopped if fixes are late, in logs as well as in streams. The cause stated with each order is the
+        cause known after all these fixes, because later fixes may make it more exact. Raise SettingsError if the sides
+        of the triangle are too short for the limits.
         """
         triangle, orders = judge_fixes(fixes, self.limits), []
         seconds = fixes.time.astype("datetime64[ns]").astype(np.int64) / 1e9
@@ -376,7 +376,7 @@ class Monitor:
         return MonitoredLog(fixes=fixes, triangle=triangle, orders=latched)
 
     def silent(self, now_s: float) -> tuple[Order, ...]:
-        """Process a time without new fixes; return the orders to be sent if fixes are late."""
+        """Advance to a time without new fixes; return the orders to be sent if fixes are late."""
         if now_s - self.state.complete_s <= self.times.late_s:
             return ()
         self.state, orders = advance(self.state, now_s, None, limits=self.times)

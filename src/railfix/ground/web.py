@@ -224,7 +224,7 @@ async def _values(request: Request) -> dict[str, Any] | None:
 
 
 class _TimedProtocol(H11Protocol):
-    """HTTP protocol that ends connections without a complete request in time, even if bytes of a request still arrive.
+    """HTTP protocol that ends connections whose request is not complete in time, even if bytes still arrive.
 
     At most `MOST_IDLE` connections of a peer wait for a request; each further connection ends the one that has waited
     longest. A peer with many connections therefore blocks neither other peers nor its own next request.

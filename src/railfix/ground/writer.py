@@ -1,6 +1,6 @@
 """Sequential commits to the database in a thread.
 
-A slow database delays only messages that require a commit in progress.
+A slow database delays only messages that wait for a commit.
 """
 
 from __future__ import annotations
@@ -63,9 +63,9 @@ def _carry_out(work: Callable[[], None], outcome: Future[None]) -> Future[None]:
 
 @dataclass(kw_only=True)
 class Commits:
-    """Commits of the centre, of which at most one is in progress, and the alarm if the store fails.
+    """Commits of the centre, at most one at a time, and the alarm if the database fails.
 
-    `alarm` is the reason why the store rejects the state, otherwise None. While there is an alarm, no authority is
+    `alarm` is the reason why the state cannot be written, otherwise None. While there is an alarm, no authority is
     sent; orders to brake are still sent.
     """
 
