@@ -1,8 +1,8 @@
 """Positions from changes of gradient and curvature (P2 2.3): features of a map, and matching of measured features.
 
 P2 uses the positions at which gradient and curvature change, instead of their values, so that slow sensor biases have
-no effect. A position is accepted under three conditions. The distance from the last accepted feature agrees, the values
-of the second quantity agree with the map, and no other position fits the measurement nearly as well.
+no effect. A position is accepted under three conditions: the wheel distance from the last accepted feature agrees with
+the map, the second quantity agrees with the map, and no other position fits nearly as well.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ import numpy as np
 from railfix.core.arrays import Floats
 from railfix.track.trajectory import Trajectory
 
-#: Quantity that changes at a feature.
+#: Quantity whose change is a feature.
 Quantity = Literal["gradient", "curvature"]
 QUANTITIES: Final[tuple[Quantity, ...]] = ("gradient", "curvature")
 
-_GRADIENT_CHANGE: Final = 0.003  #: Smallest change of gradient that is a feature: 3 permille.
-#: Smallest change of curvature that is a feature: from straight track to a radius of 1000 m [1/m].
+_GRADIENT_CHANGE: Final = 0.003  #: Smallest change of gradient that counts as a feature.
+#: Smallest change of curvature that counts as a feature [1/m]: from straight track to a radius of 1000 m.
 _CURVATURE_CHANGE_1PM: Final = 1e-3
-#: Smallest likelihood ratio of the accepted position to any other position in the window.
+#: Smallest likelihood ratio of an accepted position to any other position in the search window.
 _LIKELIHOOD_RATIO: Final = 1e3
-_GAP_SIGMAS: Final = 3.0  #: Largest deviation of the distance since the last accepted feature, in sigmas.
+_GAP_SIGMAS: Final = 3.0  #: Largest error of the wheel distance since the last feature, in sigmas.
 _FIT_LIMIT: Final = 3.0  #: Largest mean squared residual of the second quantity, in units of its variance.
 SCALE_SIGMA: Final = 2e-3  #: Relative standard deviation of a distance from wheel pulses.
 STEP_M: Final = 1.0  #: Spacing of the series along the line.
-HALF_LENGTH_M: Final = 60.0  #: Length of line that is compared before and after a feature.
+HALF_LENGTH_M: Final = 60.0  #: Length of line before and after a feature that is compared.
 #: Changes below this fraction of a larger change within `HALF_LENGTH_M` are ignored, because the curvature of a line
 #: through sparse points has ripples.
 _RIPPLE: Final = 0.2
@@ -40,14 +40,14 @@ BASE_M: Final = 15.0
 
 @dataclass(frozen=True, kw_only=True)
 class LineSeries:
-    """Gradient and curvature along a line, at N points `STEP_M` apart."""
+    """Gradient and curvature at N points along a line, `STEP_M` apart."""
 
     arc_m: Floats  #: Arc length of the points, shape (N,).
-    gradient: Floats  #: Height change per horizontal length, in the direction of rising arc length; shape (N,).
+    gradient: Floats  #: Height change per horizontal length, positive if the line climbs, shape (N,).
     curvature_1pm: Floats  #: Curvature, positive to the right in the direction of rising arc length; shape (N,).
 
     def of(self, quantity: Quantity) -> Floats:
-        """Return the values of one quantity."""
+        """Return the values of the given quantity."""
         return self.gradient if quantity == "gradient" else self.curvature_1pm
 
 
@@ -61,7 +61,7 @@ class Feature:
 
 
 def line_series(trajectory: Trajectory) -> LineSeries:
-    """Compute the gradient and curvature of a trajectory over chords of `BASE_M`, as for a vehicle on two bogies."""
+    """Compute gradient and curvature of a trajectory over chords of `BASE_M`, as measured on two bogies."""
     half = 0.5 * BASE_M
     arc = np.arange(half, float(trajectory.arc_m[-1]) - half, STEP_M)
     front, rear = trajectory.at_arc(arc + half), trajectory.at_arc(arc - half)
@@ -82,9 +82,8 @@ def line_series(trajectory: Trajectory) -> LineSeries:
 def map_features(series: LineSeries, *, least: Mapping[Quantity, Floats] | None = None) -> list[Feature]:
     """Find the largest changes of gradient and of curvature over `BASE_M`, in the order of their arc lengths.
 
-    A feature is at the middle of its change. For a measured line, `least` has, for each quantity, a lower bound of
-    changes at each point, shape (N,). A change must then also exceed the root sum of squares of the bounds at its two
-    ends.
+    The position of a feature is the middle of its change. For a measured line, `least` has a bound per point and
+    quantity, shape (N,). A change is then ignored below the root sum of squares of the bounds at its two ends.
     """
     reach, around_steps = 2 * max(round(BASE_M / STEP_M), 1), round(HALF_LENGTH_M / STEP_M)
     found: list[Feature] = []
@@ -96,7 +95,7 @@ def map_features(series: LineSeries, *, least: Mapping[Quantity, Floats] | None 
             size[size < np.hypot(least[quantity][reach:], least[quantity][:-reach])] = 0.0
         while len(size) and size.max() >= limit:
             k = int(np.argmax(size))
-            # the feature is in the middle of the stretch where the change has at least half of its maximum
+            # the change extends over the stretch where it has at least half of its maximum
             less = np.flatnonzero(np.where(change * change[k] > 0.0, size, 0.0) < 0.5 * size[k])
             first, end = int(np.max(less[less < k], initial=-1)) + 1, int(np.min(less[less > k], initial=len(size)))
             arc = 0.5 * float(series.arc_m[first] + series.arc_m[end - 1 + reach])
@@ -112,11 +111,11 @@ class LocatedFeature:
     """Position of a measured series on the line."""
 
     verdict: Literal["accepted", "ambiguous", "none"]
-    arc_m: float  #: Arc length of the middle of the series; NaN unless accepted.
+    arc_m: float  #: Arc length of the middle of the series; NaN if not accepted.
     #: Standard deviation ``sqrt(S / integral (dq/ds)^2 ds)`` with the noise density S of the measured quantity q; NaN
     #: if the series does not determine the position better than the prediction.
     sigma_m: float
-    reason: str = ""  #: Reason for a rejection.
+    reason: str = ""  #: Reason if the position is not accepted.
 
 
 def locate(
@@ -146,14 +145,14 @@ def locate(
     noise : tuple of float
         Standard deviations of gradient [1] and curvature [1/m] at one point of the series.
     last : tuple of float, optional
-        Arc length of the last accepted feature, its sigma, and the wheel distance from that feature [m].
+        Arc length of the last accepted feature, its sigma, and the wheel distance travelled since that feature [m].
 
     Returns
     -------
     LocatedFeature
         The verdict is "ambiguous" if another position fits nearly as well, or if the best fit is at the edge of the
-        window. It is "none" if the series has no sharp change, or if the second quantity or `last` contradicts the
-        position.
+        search window. The verdict is "none" if the series has no sharp change, or if the second quantity or `last`
+        contradicts the position.
     """
     offsets = np.arange(-4.0 * sigma_m, 4.0 * sigma_m + STEP_M, 0.25 * STEP_M)
     at = predicted_m + offsets[:, None] + measured.arc_m
@@ -166,24 +165,24 @@ def locate(
     information = float(((slope - slope.mean()) ** 2).sum()) / spread**2
     best = int(np.argmax(likelihood))
     if information < 16.0 / sigma_m**2:
-        return _unplaced("none", np.nan, "no change sharper than the prediction")
+        return _unplaced("none", np.nan, "no change is sharp enough to improve the prediction")
     sigma = float(1.0 / np.sqrt(information))
     place = predicted_m + float(offsets[best]) + _vertex(likelihood, best) * 0.25 * STEP_M
     apart = np.abs(offsets - offsets[best]) > max(5.0 * sigma, 2.0 * STEP_M)
     if best in (0, len(offsets) - 1):
-        return _unplaced("ambiguous", sigma, "best at the edge of the window")
+        return _unplaced("ambiguous", sigma, "best fit at the edge of the search window")
     if apart.any() and likelihood[best] - likelihood[apart].max() < np.log(_LIKELIHOOD_RATIO):
-        return _unplaced("ambiguous", sigma, "another place fits nearly as well")
+        return _unplaced("ambiguous", sigma, "another position fits nearly as well")
     other: Quantity = QUANTITIES[1 - QUANTITIES.index(quantity)]
     rest = measured.of(other) - np.interp(place + measured.arc_m, line.arc_m, line.of(other))
     misfit = float(((rest - rest.mean()) ** 2).mean()) / noise[QUANTITIES.index(other)] ** 2
     if misfit > _FIT_LIMIT:
-        return _unplaced("none", sigma, f"the {other} does not fit there")
+        return _unplaced("none", sigma, f"the {other} does not agree with the map at this position")
     if last is not None:
         gap = place - last[0]
         allowed = _GAP_SIGMAS * np.sqrt(sigma**2 + last[1] ** 2 + (SCALE_SIGMA * last[2]) ** 2)
         if abs(gap - last[2]) > allowed:
-            return _unplaced("none", sigma, "distance to the last feature disagrees")
+            return _unplaced("none", sigma, "distance from the last feature disagrees with the wheel")
     return LocatedFeature(verdict="accepted", arc_m=place, sigma_m=sigma)
 
 
@@ -192,7 +191,7 @@ def _unplaced(verdict: Literal["ambiguous", "none"], sigma_m: float, reason: str
 
 
 def _vertex(values: Floats, best: int) -> float:
-    """Return the offset of the vertex of the parabola through a maximum and its two neighbours, in steps."""
+    """Return the offset from a maximum to the vertex of the parabola through it and its two neighbours, in steps."""
     if best in (0, len(values) - 1):
         return 0.0
     left, middle, right = values[best - 1 : best + 2]

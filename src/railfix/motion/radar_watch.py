@@ -1,4 +1,4 @@
-"""Detection of a scale step or missing output of a radar, by comparison with speeds from satellite Dopplers."""
+"""Detection of a scale step or of missing speeds of a radar, by comparison with speeds from satellite Dopplers."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from railfix.core.nearest_times import nearest_rows
 from railfix.motion.samples import RadarSpeeds
 
 _WINDOW_NS: Final = 30_000_000_000  #: Length of the windows over which the ratio of the speeds is computed [ns].
-_LEAST_SPEEDS: Final = 10  #: Minimum number of speeds in a window that is used.
+_LEAST_SPEEDS: Final = 10  #: Minimum number of speeds for a window to be used.
 #: Largest time difference between a radar speed and the satellite-derived speed with which it is compared [ns].
 _NEAR_NS: Final = 150_000_000
 _MOVING_MPS: Final = 3.0  #: Lowest speed of the train at which speeds are compared [m/s].
-_LEAST_BEFORE: Final = 5  #: Minimum number of windows before a step.
-_MOST_BEFORE: Final = 20  #: Maximum number of windows before a step.
-_AFTER: Final = 3  #: Number of windows after a step.
-_SILENT: Final = 2  #: Number of consecutive windows without a radar speed after which an alarm is raised.
-_STEP: Final = 0.01  #: Smallest reported step of the ratio.
-_SCATTERS: Final = 5.0  #: Smallest reported step, as a multiple of the scatter of the windows before the step.
-_LEAST_SCATTER: Final = 0.001  #: Lower bound of the scatter of the windows before the step.
+_LEAST_BEFORE: Final = 5  #: Minimum number of windows required before a step.
+_MOST_BEFORE: Final = 20  #: Maximum number of windows used before a step.
+_AFTER: Final = 3  #: Number of windows used after a step.
+_SILENT: Final = 2  #: Number of consecutive windows without a radar speed that raise an alarm.
+_STEP: Final = 0.01  #: Smallest step of the ratio of the speeds that is reported.
+_SCATTERS: Final = 5.0  #: Smallest step that is reported, as a multiple of the scatter before it.
+_LEAST_SCATTER: Final = 0.001  #: Lower bound of the scatter of the ratio before a step.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,8 +33,7 @@ class RadarAlarm:
     #: "mounting": the ratio of the speeds has a step. "silent": there is no radar speed while the train moves.
     kind: Literal["mounting", "silent"]
     time: np.datetime64  #: Start of the first window with the fault.
-    #: Ratio of the radar speed to the satellite-derived speed, minus 1, before and after a step; NaN if the kind is
-    #: "silent".
+    #: Ratio of the radar speed to the satellite-derived speed, minus 1, before and after a step; NaN if "silent".
     before: float = float("nan")
     after: float = float("nan")
 
@@ -57,17 +56,17 @@ class RadarWatch:
 
     #: Ratio of the radar speed to the satellite-derived speed, minus 1, in each window.
     ratio: deque[float] = field(default_factory=lambda: deque(maxlen=_MOST_BEFORE + _AFTER))
-    #: Number of each window, counted from the origin of datetime64.
+    #: Index of each window, counted from 1970.
     window: deque[int] = field(default_factory=lambda: deque(maxlen=_MOST_BEFORE + _AFTER))
     silent: int = 0  #: Number of consecutive windows without a radar speed.
     _open: int = -1
     _sums: Floats = field(default_factory=lambda: np.zeros(4))
 
     def take(self, time: Datetimes, radar_mps: Floats, right_mps: Floats) -> list[RadarAlarm]:
-        """Add radar and satellite-derived speeds, and return the alarms raised.
+        """Add radar and satellite-derived speeds, and return the resulting alarms.
 
         All arrays have shape (N,). `time` must be later than all previous times. `right_mps` are the satellite-derived
-        speeds. Speeds that were not measured are NaN.
+        speeds. Missing speeds are NaN.
         """
         moving = np.abs(right_mps) > _MOVING_MPS
         heard = np.isfinite(radar_mps[moving])
@@ -84,7 +83,7 @@ class RadarWatch:
         return found
 
     def take_samples(self, radar: RadarSpeeds, time: Datetimes, right_mps: Floats) -> list[RadarAlarm]:
-        """Add satellite-derived speeds, each with the radar speed nearest in time, and return the alarms raised."""
+        """Add satellite-derived speeds, each with the radar speed nearest in time, and return the resulting alarms."""
         row = nearest_rows(radar.time, time, within_ns=_NEAR_NS)
         return self.take(time, np.append(radar.speed_mps, np.nan)[row], right_mps)
 
@@ -109,7 +108,7 @@ class RadarWatch:
         if not (np.abs(apart).min() > max(_STEP, _SCATTERS * scatter) and abs(np.sign(apart).sum()) == _AFTER):
             return []
         begin = np.datetime64(self.window[-_AFTER] * _WINDOW_NS, "ns")
-        for _ in range(len(ratios) - _AFTER):  # later windows are compared with the windows after the step
+        for _ in range(len(ratios) - _AFTER):  # later windows are compared only with windows after the step
             self.ratio.popleft()
             self.window.popleft()
         return [RadarAlarm(kind="mounting", time=begin, before=middle, after=float(np.median(after)))]

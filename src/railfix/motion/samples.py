@@ -1,7 +1,7 @@
-"""Samples of the on-board sensors as read-only arrays, and formulas of Doppler radar and two-way ranges (P2 3).
+"""Samples of the on-board sensors as read-only arrays, and formulas for Doppler radar and two-way ranges (P2 3).
 
-Times are GPS times in ascending order. Values are NaN where nothing was measured. If a radar beam points by an angle
-alpha below the direction of travel, the relative error of the speed is ``tan(alpha)`` times the error of alpha.
+Times are GPS times in ascending order. Missing values are NaN. If a radar beam points by an angle alpha below the
+direction of travel, the relative error of the speed is ``tan(alpha)`` times the error of alpha.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Samples(RowArrays):
 class TachometerPulses(Samples):
     """N pulses of a tachometer."""
 
-    #: Consecutive number of the pulse; a gap in the numbers means lost pulses; shape (N,).
+    #: Consecutive number of each pulse, shape (N,). Missing numbers are lost pulses.
     pulse: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     #: 1 if the vehicle moves forward, -1 if backward, 0 if the sensor does not report the direction; shape (N,).
     direction: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
@@ -84,7 +84,7 @@ class GroundUnits:
 
 @dataclass(frozen=True, kw_only=True)
 class BaliseReadings(Samples):
-    """N passages of the train's reader over balises; in a group of balises, only the listed balise has a reading."""
+    """N readings of balises by the train. In a group of balises, only the balise in the balise list has a reading."""
 
     balise: Strings = field(default_factory=lambda: np.empty(0, dtype="<U1"))  #: Identity of the balise, shape (N,).
     #: Standard deviation along the line, reported by the reader; NaN if not reported; shape (N,).
@@ -93,12 +93,12 @@ class BaliseReadings(Samples):
 
 @dataclass(frozen=True, kw_only=True)
 class ListedBalises:
-    """M balises and virtual balises (points whose passage is reported) along a line."""
+    """M balises and virtual balises along a line. A virtual balise is a point whose passage railfix reports."""
 
     name: Strings  #: Name of each balise, shape (M,).
     chainage_m: Floats  #: Chainage of each balise, shape (M,).
     sigma_m: Floats  #: Standard deviation of the chainage, shape (M,).
-    virtual: Masks  #: True for a point whose passage is reported although there is no balise; shape (M,).
+    virtual: Masks  #: True for virtual balises, shape (M,).
 
     def __len__(self) -> int:
         return len(self.name)
@@ -111,15 +111,15 @@ class ListedBalises:
 
 @dataclass(frozen=True, kw_only=True)
 class SensorSamples:
-    """Samples of all on-board sensors received since the previous chunk; no rows for a sensor that sent nothing."""
+    """Samples of all on-board sensors received since the previous chunk; empty for a sensor without samples."""
 
     tachometer: TachometerPulses = field(default_factory=TachometerPulses)
     inertial: InertialSamples = field(default_factory=InertialSamples)
     radar: RadarSpeeds = field(default_factory=RadarSpeeds)
     ranging: StationRanges = field(default_factory=StationRanges)
     balises: BaliseReadings = field(default_factory=BaliseReadings)
-    #: Sensors whose samples up to the epoch have not arrived (live positioning), so that their values since the
-    #: previous epoch are unknown. The samples may arrive with the next epoch.
+    #: Sensors whose samples up to the epoch have not arrived in live positioning. Their values since the previous epoch
+    #: are unknown, but may arrive with the next epoch.
     silent: frozenset[str] = frozenset()
 
     @property
@@ -128,7 +128,7 @@ class SensorSamples:
         return {name: getattr(self, name) for name in SENSORS}
 
     def between(self, begin: np.datetime64, end: np.datetime64) -> SensorSamples:
-        """Return the samples after `begin` up to and including `end`; all up to `end` if `begin` is NaT."""
+        """Return the samples after `begin` up to and including `end`; if `begin` is NaT, all samples up to `end`."""
         parts: dict[str, Any] = {}
         for name, rows in self.tables.items():
             first = 0 if np.isnat(begin) else int(np.searchsorted(rows.time, begin, side="right"))
@@ -137,7 +137,7 @@ class SensorSamples:
         return SensorSamples(**parts, silent=self.silent)
 
     def merge(self, later: SensorSamples) -> SensorSamples:
-        """Return both sets of samples in order of time, with `silent` from `later`."""
+        """Return these and later samples in order of time, with `silent` from `later`."""
         parts: dict[str, Any] = {}
         for name, after in later.tables.items():
             before: Samples = getattr(self, name)
@@ -154,7 +154,7 @@ class SensorSamples:
 def two_way_range_m(delay_s: Floats, answer_s: float) -> Floats:
     """Return the two-way range [m]: ``(delay_s - answer_s) c / 2`` (P2 3.3, equation 1).
 
-    `delay_s` is the time from request to answer, `answer_s` the processing time of the station.
+    `delay_s` is the time from the request to the reception of the answer, `answer_s` the station's processing time.
     """
     return np.asarray((delay_s - answer_s) * SPEED_OF_LIGHT / 2.0)
 

@@ -14,8 +14,7 @@ def singer_steps(dt: Floats, sigma_mps2: float, tau_s: float) -> tuple[Floats, F
     The acceleration is a first-order Gauss-Markov process (R. A. Singer 1970, doi:10.1109/TAES.1970.310128) with the
     standard deviation `sigma_mps2` [m/s2] and the time constant `tau_s` [s]. `dt` [s] are the time steps, shape (K,).
     The process is discretised with a matrix exponential (C. F. Van Loan 1978, doi:10.1109/TAC.1978.1101743). A step
-    longer than `tau_s` is halved repeatedly and composed again, because the matrix exponential of a long step would
-    lose digits.
+    longer than `tau_s` is composed of equal shorter steps, because a matrix exponential loses digits in long steps.
     """
     halvings = np.ceil(np.log2(np.maximum(dt / tau_s, 1.0))).astype(np.int64)
     part = dt / 2.0**halvings

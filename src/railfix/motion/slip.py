@@ -3,15 +3,15 @@ r"""Detection of slip, slide, low speed and rolling away by the vehicle's pitch 
 While the wheel rolls, ``sin(theta_T) = (f_x - a_T) / g`` from accelerometer and tachometer is the sine of the pitch.
 During a slip, this sine exceeds the gradient of any line. There are two rules:
 
-* ``"p2"`` detects a slip where ``|sin(theta_T)|`` exceeds the steepest gradient and the pitching of the body. The rule
-  detects only changes of the slip speed, so that most of a long slide at constant slip speed remains in the distance.
-* ``"map"`` compares the pitch with the gradient of the line at the present position, and has a latch: a slip ends only
-  when the wheel has returned to the inertial speed and the pitch agrees, or when wheel and train are at rest.
+* ``"p2"`` detects a slip where ``|sin(theta_T)|`` exceeds the steepest gradient plus an allowance for the pitch of the
+  body. This rule detects only changes of the slip speed. The distance error of a long slide at constant slip remains.
+* ``"map"`` compares the pitch with the gradient of the line at the present position. Here, a slip ends only when both
+  the wheel speed agrees with the inertial speed and the pitch agrees, or when wheel and train are at rest (latch).
 
-During a slip, speed and distance are integrated from the accelerometer, corrected for pitch and offset. The integration
-starts `LOOK_BACK_S` before the detection. The offset is estimated while the wheel rolls. Without a gyro, the pitch of
-the line is used where the position is known. With a gyro, the pitch is the integral of the pitch rate, with a slow
-correction to the line or, where the line is unknown, to the pitch from wheel and accelerometer (P2 2.1(3)).
+During a slip, speed and distance are integrated from the accelerometer, corrected for pitch and offset. With "map", the
+integration starts before the detection (`LOOK_BACK_S`). The offset is estimated while the wheel rolls. Without a gyro,
+the pitch is the slope of the line where the position is known. With a gyro, the pitch is the integral of the pitch rate
+(P2 2.1(3)). It is slowly corrected to the slope of the line, or to the pitch from wheel and accelerometer.
 """
 
 from __future__ import annotations
@@ -36,54 +36,55 @@ class MotionState(IntEnum):
     INIT = 0  #: Not yet initialised; there is no speed.
     STANDING = 1  #: At rest: there was no pulse for a second, and the inertial speed is small.
     LOW_SPEED = 2  #: The train moves too slowly for the tachometer; the speed is inertial.
-    NORMAL = 3  #: The wheel rolls; the speed is that of the wheel.
+    NORMAL = 3  #: The wheel rolls without slip; the speed is the wheel speed.
     INERTIAL_SPIN = 4  #: The wheel is faster than the train; the speed is inertial.
     INERTIAL_SLIDE = 5  #: The wheel is slower than the train; the speed is inertial.
     ROLLING = 6  #: The train rolls away from rest, too slowly for the tachometer; the speed is inertial.
     EXPIRED = 7  #: The inertial speed is too old or implausible; there is no speed.
 
 
-#: Limit of the difference between the pitch sines of vehicle and line, equivalent to an acceleration of 0.15 m/s2.
+#: Largest difference of the pitch sines of vehicle and line without a slip, equivalent to 0.15 m/s2.
 _MAP_LIMIT: Final = 0.015
-#: Lower bound of this limit, in standard deviations of the difference while the wheel rolls. This bound is needed
-#: because a pitching body accelerates the accelerometer, the more the higher the accelerometer is mounted.
+#: The same limit in standard deviations of this difference while the wheel rolls; the larger limit is used. It is
+#: needed because a pitching body accelerates an accelerometer that is mounted high.
 _NOISE_SIGMAS: Final = 5.0
-_NOISE_S: Final = 30.0  #: Time constant of the estimate of this standard deviation.
-_LATCH_MPS: Final = 0.15  #: Difference of wheel and inertial speeds within which a slip ends.
-_LATCH_SHARE: Final = 0.01  #: The same difference as a fraction of the speed; the larger of both differences is used.
+_NOISE_S: Final = 30.0  #: Time constant with which this standard deviation is estimated.
+_LATCH_MPS: Final = 0.15  #: Largest difference of wheel and inertial speeds at which a slip can end.
+_LATCH_SHARE: Final = 0.01  #: The same limit as a fraction of the speed; the larger limit is used.
 _LATCH_S: Final = 0.5  #: Time for which the speeds must agree before a slip ends.
-LOOK_BACK_S: Final = 0.3  #: Time before the detection at which the inertial speed begins.
-#: Time after which the inertial speed expires; `carry_drift_mps2` then amounts to 0.3 m/s.
+LOOK_BACK_S: Final = 0.3  #: Start of the inertial speed: this time, `confirm_s` and `SMOOTHING_S` before the detection.
+#: Longest use of an inertial speed, whose assumed drift `carry_drift_mps2` then amounts to 0.3 m/s.
 _LONGEST_CARRY_S: Final = 30.0
-#: Time constant of the low-pass filter of the pitch, which suppresses pitching of the body (about 1 Hz) and vibration.
+#: Time constant of the low-pass filter of the pitch. It suppresses pitching of the body (about 1 Hz) and vibration.
 SMOOTHING_S: Final = 0.2
 _STANDING_S: Final = 1.0  #: Time without a pulse after which the vehicle is assumed at rest.
-_STANDING_MPS: Final = 0.5  #: Largest inertial speed that agrees with a stationary wheel.
-_PITCH_S: Final = 20.0  #: Time constant with which the pitch integrated from the gyro is corrected.
-#: Largest plausible sine of the pitch: 0.035 for the line, and a margin for body and mounting.
+_STANDING_MPS: Final = 0.5  #: Largest inertial speed at which a train without pulses is assumed at rest.
+_PITCH_S: Final = 20.0  #: Time constant of the correction of a pitch integrated from the gyro.
+#: Largest plausible sine of the pitch from wheel and accelerometer: 0.035 for the line, and a margin.
 _STEEPEST: Final = 0.1
 _FASTEST_MPS: Final = 100.0  #: Largest plausible inertial speed.
-#: Time for which the body pitches after a stop. Later, the measured pitch is used as the pitch at standstill.
+#: Time for which the body pitches after a stop. After this time, the measured pitch is the pitch at standstill.
 _SETTLING_S: Final = 2.0
 _ROLLING_LIMIT: Final = 0.002  #: Change of the pitch sine since standstill that indicates rolling away.
 _ROLLING_S: Final = 0.3  #: Time for which this change must persist.
-_ROLLING_MPS: Final = 0.05  #: Inertial speed that the train must also have reached.
+_ROLLING_MPS: Final = 0.05  #: Inertial speed that the train must also exceed.
 
 
 class SlipLimits(Settings):
     """Limits of the slip detection."""
 
-    #: Whether the pitch is compared with the gradient of the line ("map"), or with the constant `p2_limit`, without
-    #: latch and look-back ("p2").
+    #: "map" to compare the pitch with the gradient of the line, "p2" to compare it with the constant `p2_limit`,
+    #: without latch and look-back.
     rule: Literal["map", "p2"] = "map"
-    #: Largest sine of the pitch without slip in "p2": 35 permille for the line (P2 2.1), 10 permille for the body.
+    #: Largest sine of the pitch without a slip: 35 permille for the line (P2 2.1) and 10 permille for the body. It is
+    #: used by the rule "p2", and by "map" where neither the line nor a gyro is available.
     p2_limit: float = Field(default=0.045, gt=0)
     confirm_s: float = Field(default=0.1, ge=0)  #: Time for which the limit must be exceeded before a slip is declared.
-    #: Drift of the inertial speed, by which the speed limit of the latch grows. 1e-3 of gravity covers accelerometer
-    #: offset and pitch error together.
+    #: Assumed drift of the inertial speed; the speed tolerance of the latch grows at this rate. 1e-3 of gravity covers
+    #: accelerometer offset and pitch error together.
     carry_drift_mps2: float = Field(default=0.01, ge=0)
-    offset_s: float = Field(default=60.0, gt=0)  #: Time constant of the estimated accelerometer offset.
-    #: Time constant of the estimated gyro bias.
+    offset_s: float = Field(default=60.0, gt=0)  #: Time constant with which the accelerometer offset is estimated.
+    #: Time constant with which the gyro bias is estimated.
     bias_s: float = Field(default=200.0, gt=0)
 
 
@@ -91,12 +92,12 @@ class SlipLimits(Settings):
 class SlipResult:
     """Speed, distance and state of motion at N samples."""
 
-    state: Codes  #: `MotionState`, shape (N,).
-    #: Wheel speed in NORMAL, NaN in INIT and EXPIRED, 0 or inertial speed in other states; shape (N,).
+    state: Codes  #: Values of `MotionState`, shape (N,).
+    #: Speed, shape (N,): wheel speed in NORMAL, NaN in INIT and EXPIRED, 0 or the inertial speed in other states.
     speed_mps: Floats
-    #: Integral of the speed from the first sample, shape (N,). From `LOOK_BACK_S` before the detection of a slip, the
-    #: inertial speed is integrated. At the end of the slip, the distance is corrected for the difference of wheel and
-    #: inertial speeds, which is assumed to have grown linearly.
+    #: Integral of the speed from the first sample, shape (N,); the inertial speed of a slip begins before its detection
+    #: (`LOOK_BACK_S`). At the end of a slip, the distance is corrected for the difference of wheel and inertial speeds,
+    #: which is assumed to have grown linearly.
     distance_m: Floats
     #: Sine of the pitch from wheel and accelerometer, minus `pitch`; NaN without pulses; shape (N,).
     metric: Floats
@@ -114,17 +115,17 @@ class SlipState:
 
 
 def pitch_rate_radps(force_mps2: Floats, rate_radps: Floats, speed_mps: Floats) -> Floats:
-    """Compute the rate of the pitch angle from the body rates, shape (N, 3), and the roll, shape (N,) [rad/s].
+    """Compute the rate of the pitch angle [rad/s], shape (N,), from body forces and rates, shape (N, 3).
 
-    The rate is ``w_y cos(phi) - w_z sin(phi)`` with the roll ``sin(phi) = (v w_z - f_y) / g``, because the body leans
-    with the cant. If the roll were ignored, the rate would be wrong by 3.4 mrad/s in a curve of 400 m radius at 17 m/s.
+    The rate is ``w_y cos(phi) - w_z sin(phi)`` with the roll ``sin(phi) = (v w_z - f_y) / g``, which results from the
+    cant. Without the roll, the rate would be wrong by 3.4 mrad/s in a curve of 400 m radius at 17 m/s.
     """
     sine = roll_sine(force_mps2, rate_radps, speed_mps)
     return np.asarray(rate_radps[:, 1] * np.sqrt(1.0 - sine**2) - rate_radps[:, 2] * sine)
 
 
 def heading_rate_radps(force_mps2: Floats, rate_radps: Floats, speed_mps: Floats) -> Floats:
-    """Compute the rate of the heading from the body rates, shape (N,) [rad/s]: ``w_z cos(phi) + w_y sin(phi)``."""
+    """Compute the rate of the heading [rad/s], shape (N,): ``w_z cos(phi) + w_y sin(phi)``, with the roll phi."""
     sine = roll_sine(force_mps2, rate_radps, speed_mps)
     return np.asarray(rate_radps[:, 2] * np.sqrt(1.0 - sine**2) + rate_radps[:, 1] * sine)
 
@@ -135,30 +136,29 @@ def roll_sine(force_mps2: Floats, rate_radps: Floats, speed_mps: Floats) -> Floa
 
 
 class MotionSamples(NamedTuple):
-    """N samples of wheel and body motion, 10 to 100 per second."""
+    """N samples of wheel and body motion, at 10 to 100 Hz."""
 
     time_s: Floats  #: Times in ascending order, shape (N,).
     wheel_mps: Floats  #: Speed of the wheel, NaN without pulses; shape (N,).
     wheel_mps2: Floats  #: Acceleration of the wheel, NaN without pulses; shape (N,).
     force_mps2: Floats  #: Specific force in the forward direction of the vehicle, shape (N,).
-    #: Sine of the line's slope angle at the vehicle, positive if the line rises forward; NaN if unknown; shape (N,).
+    #: Sine of the line's slope angle at the vehicle, shape (N,), positive if the line rises forward; NaN if unknown.
     line_sine: Floats
-    #: Specific force to the right, pitch rate and yaw rate of the body, shape (N, 3) [m/s2, rad/s, rad/s]; NaN if
-    #: missing. The pitch rate (`pitch_rate_radps`) is computed with the inertial speed during a slip, because the speed
-    #: of the slipping wheel would result in a wrong roll.
+    #: Specific force to the right [m/s2], pitch rate and yaw rate of the body [rad/s], shape (N, 3); NaN if missing.
+    #: `find_slips` computes the rate of the pitch angle with the inertial speed during a slip, because the speed of a
+    #: slipping wheel would result in a wrong roll.
     body: Floats | None = None
-    #: Time since the last pulse, shape (N,). This time is needed where a creeping train has pulses without a speed; if
-    #: it is missing, the time since the last speed is used.
+    #: Time since the last pulse, shape (N,); if missing, the time since the last wheel speed is used instead. A very
+    #: slow train has pulses, but no wheel speed.
     since_pulse_s: Floats | None = None
 
 
 def find_slips(
     samples: MotionSamples, *, limits: SlipLimits | None = None, state: SlipState | None = None
 ) -> tuple[SlipResult, SlipState | None]:
-    """Compute the state of motion, the speed and the distance at each sample from this and all earlier samples.
+    """Compute state of motion, speed and distance at each sample from samples up to this sample.
 
-    `state` is the state returned by the previous call, None at the start. The second returned value is the state for
-    the next call.
+    `state` is the state returned by the previous call, None at the start. Also return the state for the next call.
     """
     limits, (time_s, *given, body, since_pulse_s) = limits or SlipLimits(), samples
     size = len(time_s)
@@ -209,11 +209,11 @@ class _Automaton:
     _stood: float = 0.0
     _learnt: float = 0.0
     _rest: float = float("nan")
-    #: Time, speed and inertial acceleration of past samples, from which `_look_back` recomputes the speed.
+    #: Time, speed and inertial acceleration of past samples, for `_look_back`.
     _past: deque[tuple[float, float, float]] = field(default_factory=lambda: deque(maxlen=200))
 
     def copy(self, limits: SlipLimits) -> _Automaton:
-        """Return a copy with the given limits, so that `SlipState` objects already returned stay unchanged."""
+        """Return a copy with the given limits; a `SlipState` that was already returned must stay unchanged."""
         return replace(self, limits=limits, _past=self._past.copy())
 
     def row(self) -> tuple[float, ...]:
@@ -241,7 +241,7 @@ class _Automaton:
         if self.metric == self.metric:
             share = min(dt / SMOOTHING_S, 1.0)
             self._smooth += share * (self.metric - self.offset / GRAVITY_MPS2 - self._smooth)
-        # without line and gyro, the reference pitch is constant, and valid only at an earlier position
+        # without line and gyro, the reference pitch remains constant and belongs to an earlier position
         least = _MAP_LIMIT if sine == sine or rate == rate else limits.p2_limit
         self._limit = max(least, _NOISE_SIGMAS * self._square**0.5)
         if self.state in (MotionState.INERTIAL_SPIN, MotionState.INERTIAL_SLIDE):
@@ -256,7 +256,7 @@ class _Automaton:
         self._past.append((self._age, self.speed, inertial))
 
     def _pitch_rate(self, wheel: float, right: float, pitching: float, yawing: float) -> float:
-        """Return `pitch_rate_radps` of a sample, with the inertial speed during a slip."""
+        """Return the rate of the pitch angle at a sample, during a slip computed with the inertial speed."""
         slips = self.state in (MotionState.INERTIAL_SPIN, MotionState.INERTIAL_SLIDE)
         speed = self.speed if slips or wheel != wheel else wheel
         lean = min(max(((speed if speed == speed else 0.0) * yawing - right) / GRAVITY_MPS2, -0.5), 0.5)
@@ -265,9 +265,7 @@ class _Automaton:
     def _follow(self, dt: float, sine: float, by_wheel: float, rate: float, *, rests: bool) -> None:
         """Update the reference pitch and the gyro bias.
 
-        Without a gyro, the pitch of the line is used. With a gyro, the pitch is the integrated rate, corrected slowly
-        to the pitch of the line, or to the pitch from wheel and accelerometer if the line is unknown. At rest, the gyro
-        bias is the mean rate over `bias_s`.
+        At rest, the gyro bias is the mean rate over `bias_s`.
         """
         limits, known = self.limits, sine == sine
         target = sine if known else by_wheel
@@ -296,12 +294,12 @@ class _Automaton:
             self.state, self.speed = MotionState.EXPIRED, float("nan")
 
     def _stand(self, force: float) -> None:
-        """Begin a standstill, with the present force as the force at rest."""
+        """Start a standstill, with the present force as the force at rest."""
         self.state, self.speed, self._rest = MotionState.STANDING, 0.0, force
         self._apart = self._carried = self._stood = 0.0
 
     def _release(self, dt: float, wheel: float, force: float, *, heard: bool) -> None:
-        """End a slip if wheel and train are at rest, or if both the wheel speed and the pitch are plausible again."""
+        """End a slip if wheel and train are at rest, or if wheel speed and pitch are plausible again."""
         limits = self.limits
         if self._silent >= _STANDING_S and abs(self.speed) < _STANDING_MPS:
             self._stand(force)
@@ -321,7 +319,7 @@ class _Automaton:
             self.state, self.speed, self._over = MotionState.NORMAL, wheel, 0.0
 
     def _roll(self, dt: float, wheel: float, acceleration: float, inertial: float, sine: float) -> None:
-        """Use the speed of the wheel, or declare a slip if the pitch contradicts this speed for `confirm_s`."""
+        """Use the wheel speed, or declare a slip if the pitch has contradicted the wheel speed for `confirm_s`."""
         limits = self.limits
         self.state, self._carried = MotionState.NORMAL, 0.0
         self._rest = float("nan")
@@ -359,7 +357,7 @@ class _Automaton:
         self.distance += new_distance - old_distance
 
     def _quiet(self, dt: float, force: float, inertial: float) -> None:
-        """Update state and speed without a pulse: low speed, standstill or rolling away."""
+        """Update state and speed of a train without pulses: low speed, standstill or rolling away."""
         if self.state == MotionState.NORMAL:
             self.state = MotionState.LOW_SPEED
         if self.state == MotionState.LOW_SPEED:
@@ -368,14 +366,14 @@ class _Automaton:
         if self.state in (MotionState.STANDING, MotionState.ROLLING):
             self._watch(dt, force)
         elif self.state == MotionState.INIT:
-            return  # a sensor that has never sent a sample may be defective
+            return  # a tachometer that has never sent a pulse may be defective
         elif self._silent >= _STANDING_S and not abs(self.speed) > _STANDING_MPS:
             self._stand(force)
         elif self._carried > _LONGEST_CARRY_S:
             self.state, self.speed = MotionState.EXPIRED, float("nan")
 
     def _watch(self, dt: float, force: float) -> None:
-        """Detect rolling away by a change of the forward force, a component of gravity, since standstill."""
+        """Detect rolling away by a change of the forward force since standstill, when it was a component of gravity."""
         limits = self.limits
         self._stood += dt
         if self.state == MotionState.STANDING and self._stood < _SETTLING_S:
@@ -388,8 +386,7 @@ class _Automaton:
                 self._rest += min(dt / limits.offset_s, 1.0) * change
                 self.speed = 0.0
                 return
-            # The accelerometer of a freely rolling train measures zero; the acceleration is the gravity component
-            # measured at rest.
+            # A freely rolling train has no forward force, so that the change since standstill equals its acceleration.
             self.speed += change * dt
             if self._apart >= _ROLLING_S and abs(self.speed) > _ROLLING_MPS:
                 self.state = MotionState.ROLLING

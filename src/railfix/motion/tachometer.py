@@ -1,7 +1,7 @@
 """Speed, acceleration and distance from the pulse times of a tachometer (P2 2.2), and checks of its settings.
 
 From pulse k0 to pulse k, the mean speed is ``(k - k0) p / (t_k - t_k0)``, with the distance per pulse p. At constant
-acceleration, this is the speed at the middle of the interval; each speed is therefore returned with this instant.
+acceleration, this is the speed at the middle of the interval, so that each speed is returned with this time.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from railfix.core.settings import Settings
 from railfix.core.timescale import seconds, timedelta
 from railfix.motion.samples import TachometerPulses
 
-#: Names of speed units by their conversion factors from m/s.
+#: Names of speed units, by their conversion factors from m/s.
 _UNITS: Final = {3.6: "km/h", 2.2369: "miles per hour", 1.94384: "knots"}
-#: Largest relative deviation from a unit's factor. Wheel wear is at most 2 %, and two units differ by 15 % or more.
+#: Largest relative deviation of a speed ratio from a unit's factor. Wear is at most 2 %; units differ by 15 % or more.
 _UNIT_SHARE: Final = 0.05
-LEAST_SPEED_MPS: Final = 1.0 / 3.6  #: Speeds below this limit are not returned: 1 km/h (P2 1).
+LEAST_SPEED_MPS: Final = 1.0 / 3.6  #: Lowest speed that is returned: 1 km/h (P2 1).
 
 
 class TachometerLimits(Settings):
-    """Parameters of a tachometer and of its evaluation."""
+    """Parameters of a tachometer and of the computation of its speeds."""
 
-    wheel_diameter_m: float = Field(default=0.86, gt=0.2, lt=2.0)  #: Wheel diameter that is configured on board.
-    pulses_per_turn: int = Field(default=60, ge=1)  #: Pulses per turn of the wheel, after multiplication of edges.
-    #: Time over which a speed is computed. The usual smoothing time of a tachometer is 0.1 s (P2 3.2). If the teeth are
-    #: uneven, use the time of a full turn.
+    wheel_diameter_m: float = Field(default=0.86, gt=0.2, lt=2.0)  #: Wheel diameter configured on board.
+    pulses_per_turn: int = Field(default=60, ge=1)  #: Pulses per turn of the wheel, including an edge multiplication.
+    #: Time over which a speed is computed. The usual smoothing time of a tachometer is 0.1 s (P2 3.2). With uneven
+    #: teeth, use the time of a full turn.
     window_s: float = Field(default=0.1, gt=0)
     silence_s: float = Field(default=0.3, gt=0)  #: Time without a pulse after which the speed is NaN.
     jitter_s: float = Field(default=5e-6, ge=0)  #: Standard deviation of a pulse time.
@@ -46,17 +46,17 @@ class TachometerLimits(Settings):
 class PulseSpeeds:
     """Speeds from the pulses before N requested instants."""
 
-    #: Instant at which the speed is valid, before the requested instant; NaT without a speed; shape (N,).
+    #: Time at which each speed is valid, which precedes the requested instant, shape (N,); NaT without a speed.
     time: Datetimes
-    speed_mps: Floats  #: Speed, negative backward; NaN where the pulses give no speed; shape (N,).
-    #: Standard deviation caused by jitter and clock resolution, without the wheel scale error; shape (N,).
+    speed_mps: Floats  #: Speed, negative backward, shape (N,); NaN if not available.
+    #: Standard deviation caused by jitter and clock resolution, without the wheel scale error, shape (N,).
     sigma_mps: Floats
 
 
 def pulse_speeds(pulses: TachometerPulses, time: Datetimes, *, limits: TachometerLimits | None = None) -> PulseSpeeds:
-    """Compute the speed at each instant from the pulses of the last `window_s` up to this instant, shape (N,).
+    """Compute the speeds at N instants, each from the pulses of the last `window_s` up to the instant.
 
-    The speed is NaN if it is below `LEAST_SPEED_MPS`, after `silence_s` without a pulse, and before the second pulse.
+    A speed is NaN before the second pulse, after `silence_s` without a pulse, or if it is below `LEAST_SPEED_MPS`.
     """
     limits = limits or TachometerLimits()
     last = np.searchsorted(pulses.time, time, side="right") - 1
@@ -73,7 +73,7 @@ def pulse_speeds(pulses: TachometerPulses, time: Datetimes, *, limits: Tachomete
         size = count * limits.pulse_m / duration
         spread = size * np.sqrt(2.0 * limits.jitter_s**2 + limits.resolution_s**2 / 6.0) / duration
     valid = some & (duration > 0) & (size >= LEAST_SPEED_MPS) & (since <= limits.silence_s)
-    # the time since the last pulse gives an upper bound of the speed
+    # reject speeds over twice the largest speed that is possible without a pulse since the last one
     valid &= limits.pulse_m / np.maximum(since, 1e-9) >= 0.5 * size
     sign = np.where(pulses.direction[at] == 0, 1.0, pulses.direction[at])
     middle = pulses.time[first] + (pulses.time[at] - pulses.time[first]) // 2
@@ -85,10 +85,10 @@ def pulse_speeds(pulses: TachometerPulses, time: Datetimes, *, limits: Tachomete
 
 
 def window_start(time: Datetimes, last: Indices, window_s: float) -> Indices:
-    """Return the index of the pulse at which the window of each pulse `last` starts.
+    """Return the index of the first pulse in the window that ends at each pulse `last`.
 
-    The window starts at the last pulse that is at least `window_s` earlier, and at least one pulse earlier. If there is
-    no such pulse, it starts at the first pulse.
+    The first pulse is the latest pulse at least `window_s` before `last`, or pulse 0 if there is none. It is never
+    `last` itself, except for pulse 0.
     """
     start = np.searchsorted(time, time[last] - timedelta(np.full(len(last), window_s)), side="right") - 1
     return np.asarray(np.maximum(np.minimum(start, last - 1), 0), dtype=np.intp)
@@ -101,10 +101,10 @@ def pulse_acceleration(early: PulseSpeeds, late: PulseSpeeds) -> Floats:
 
 
 def distance_m(pulses: TachometerPulses, time: Datetimes, *, limits: TachometerLimits | None = None) -> Floats:
-    """Return the signed distance travelled up to each instant, from the pulses up to this instant, shape (N,) [m].
+    """Return the signed distance [m] travelled up to N instants, each from the pulses up to the instant.
 
-    Between pulses, the distance is extrapolated with the last speed, by at most one pulse. Before the first pulse, the
-    distance is 0. A pulse without direction counts as forward.
+    Between pulses, the distance is extrapolated with the last speed, by at most one pulse. The distance before the
+    first pulse is 0. A pulse without direction counts as forward.
     """
     limits = limits or TachometerLimits()
     if not len(pulses):
@@ -120,10 +120,10 @@ def distance_m(pulses: TachometerPulses, time: Datetimes, *, limits: TachometerL
 
 
 def tooth_faults(pulses: TachometerPulses) -> tuple[Masks, Masks]:
-    """Return masks of the pulses that follow a lost pulse, and of the pulses that are doubled, shape (P,) each.
+    """Return masks of the pulses that follow a lost pulse, and of doubled pulses, shape (P,) each.
 
-    A pulse counts as lost in an interval twice as long as both neighbouring intervals, or where `pulse` numbers are
-    missing. It counts as doubled where two successive intervals together equal a neighbouring interval.
+    A pulse is lost in an interval twice as long as both neighbouring intervals, or where `pulse` numbers are missing. A
+    pulse is doubled if the two intervals at it together equal each of the neighbouring intervals.
     """
     count = len(pulses)
     lost, doubled = np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
@@ -132,7 +132,7 @@ def tooth_faults(pulses: TachometerPulses) -> tuple[Masks, Masks]:
     interval = seconds(np.diff(pulses.time))
     before, after = interval[:-2], interval[2:]
     even = np.abs(before - after) < 0.3 * np.minimum(before, after)
-    with np.errstate(divide="ignore", invalid="ignore"):  # pulses with the same time tag
+    with np.errstate(divide="ignore", invalid="ignore"):  # intervals may be zero
         lost[2:-1] = even & (np.abs(interval[1:-1] / (0.5 * (before + after)) - 2.0) < 0.3)
     lost[1:] |= np.diff(pulses.pulse) > 1
     pair = interval[1:-2] + interval[2:-1]
@@ -143,9 +143,9 @@ def tooth_faults(pulses: TachometerPulses) -> tuple[Masks, Masks]:
 
 
 def faults_until(pulses: TachometerPulses, time: Datetimes) -> Integers:
-    """Return the number of lost and doubled pulses detected up to each instant, shape (N,).
+    """Return the number of lost and doubled pulses that are detected up to each of N instants.
 
-    A fault is detected two pulses later. Lost pulses that are evident from missing `pulse` numbers are not counted.
+    A fault is detected two pulses later. Lost pulses with missing `pulse` numbers are not counted.
     """
     lost, doubled = tooth_faults(pulses)
     total = np.concatenate([[0], np.cumsum((lost & (np.diff(pulses.pulse, prepend=pulses.pulse[:1]) < 2)) | doubled)])
@@ -156,20 +156,20 @@ def faults_until(pulses: TachometerPulses, time: Datetimes) -> Integers:
 class SpeedCheck:
     """Scale, unit and delay of logged speeds relative to reference speeds."""
 
-    ratio: float  #: Ratio of logged to reference speed, after conversion from `unit`.
-    unit: str  #: Detected unit of the logged speeds, "m/s" unless the ratio is near another unit's factor.
+    ratio: float  #: Ratio of logged to reference speeds, after conversion from `unit`.
+    unit: str  #: Detected unit of the logged speeds; "m/s" if no other unit fits the ratio.
     lag_s: float  #: Delay of the logged speeds.
 
 
-#: Largest delay, positive or negative, in the search [s].
+#: Largest positive or negative delay in the search [s].
 _LARGEST_LAG_S: Final = 3.0
 
 
 def check_speeds(time: Datetimes, speed_mps: Floats, right_time: Datetimes, right_mps: Floats) -> SpeedCheck:
-    """Estimate scale, unit and delay of logged speeds, shape (N,), by least squares over a grid of delays.
+    """Estimate scale, unit and delay of logged speeds by least squares over a grid of delays.
 
-    `right_time` and `right_mps` are reference speeds, shape (M,), for example from Dopplers. Absolute speeds are
-    compared. Raise ValueError with fewer than ten common speeds over 1 m/s.
+    `speed_mps`, shape (N,), are logged speeds. `right_mps`, shape (M,), are reference speeds, for example from
+    Dopplers. Absolute speeds are compared. Raise ValueError if fewer than ten common speeds exceed 1 m/s.
     """
     known = np.isfinite(right_mps)
     right_t = seconds(right_time[known] - right_time[0])
@@ -185,7 +185,7 @@ def check_speeds(time: Datetimes, speed_mps: Floats, right_time: Datetimes, righ
             ratios[k] = float((logged * right[use]).sum() / (right[use] ** 2).sum())
             costs[k] = float(np.mean((logged / ratios[k] - right[use]) ** 2))
     if not np.isfinite(costs).any():
-        raise ValueError("fewer than ten speeds over 1 m/s in common; provide a longer log")
+        raise ValueError("fewer than ten common speeds over 1 m/s; provide a longer log")
     best = int(np.argmin(costs))
     ratio = float(ratios[best])
     unit = next((f for f in _UNITS if abs(ratio / f - 1.0) < _UNIT_SHARE), None)

@@ -1,7 +1,7 @@
-"""Filter along the track from codes, Dopplers, carrier phases and sensors, with hypotheses on the branch.
+"""Along-track filter of codes, Dopplers, carrier phases and sensor measurements, with a hypothesis per possible branch.
 
-`track` takes epochs and the state after the previous epochs, and returns positions along the trajectory and the state
-after these epochs. All quantities are numpy arrays.
+`track` requires epochs and the state after all previous epochs. It returns the positions of these epochs along the
+trajectory, and the state after the last of them. All quantities are numpy arrays.
 """
 
 import lazy_loader

@@ -1,6 +1,6 @@
-"""Risk budget of the filter's protection level, and kinds of the measurement sources that have a sub-filter.
+"""Risk budget of the filter's protection level, and kinds of measurement sources that have sub-filters.
 
-`railfix.kernels.tracking.subfilters` computes the sub-filters, `railfix.kernels.tracking.level` the level.
+The modules `subfilters` and `level` of `railfix.kernels.tracking` compute the sub-filters and the protection level.
 """
 
 from __future__ import annotations
@@ -22,10 +22,11 @@ from railfix.tracking.limits import TrackingLimits
 SENSORS: Final = {kind: kind.name.lower() for kind in Kind if kind >= Kind.WHEEL}
 #: Time between a constellation fault and the alert to users [s] (ARAIM milestone 3 report: one hour).
 CONSTELLATION_FAULT_S: Final = 3600.0
-#: A kind of source has no sub-filters if faults of `MOST_SOURCES` sources are less probable than this part of the risk.
+#: Negligible fraction of the risk. A kind of source has no sub-filters if the fault probability of `MOST_SOURCES` such
+#: sources is below this fraction.
 SPARED: Final = 0.1
 MOST_SOURCES: Final = 64
-#: Risk of the speed bound as a fraction of the risk of the position level.
+#: Risk allocated to the speed bound, as a fraction of the risk of the protection level.
 SPEED_SHARE: Final = 0.01
 
 
@@ -43,7 +44,7 @@ class SourceKind(IntEnum):
 
 
 #: Kinds of the sources other than satellites, constellations and sensors: all Dopplers, all phases, all codes of the
-#: satellites ahead or behind, and the map. The last sub-filter excludes no source.
+#: satellites ahead or behind, and the map. The sub-filter "all in view" excludes no source.
 OTHERS: Final = {
     "doppler": SourceKind.MOTION,
     "phase": SourceKind.MOTION,
@@ -65,25 +66,27 @@ KINDS: Final = {
 class Budget:
     """Risk per independent error, fault probabilities, and the factors K computed from both."""
 
-    risk: float  #: Risk per independent error, minus the fault probabilities of sources without a sub-filter.
+    #: Risk per independent error, after subtraction of the fault probabilities of sources without a sub-filter.
+    risk: float
     k: float  #: Two-sided normal quantile of the risk.
     #: Probability per `SourceKind` that a source is faulty or that a past fault still affects the filter; 0 for kinds
     #: without sub-filters.
     prior: tuple[float, ...]
-    #: One-sided normal quantile of risk / prior, the minimum factor of a sub-filter's sigma; 0 without sub-filters.
+    #: One-sided normal quantile of risk / prior per `SourceKind`. It is the minimum factor K of a sub-filter's sigma,
+    #: and 0 for kinds without sub-filters.
     k_fault: tuple[float, ...]
-    #: Two-sided normal quantile for the speed bound, which has the additional fraction `SPEED_SHARE` of the risk,
+    #: Two-sided normal quantile for the speed bound. The fraction `SPEED_SHARE` of the risk is added for this bound and
     #: divided equally among the sources.
     k_speed: float
-    k_speed_fault: tuple[float, ...]  #: One-sided normal quantiles for the speed bound, by kind as `k_fault`.
+    k_speed_fault: tuple[float, ...]  #: As `k_fault`, for the speed bound.
 
 
 @lru_cache(maxsize=8)
 def budget(limits: TrackingLimits) -> Budget:
-    """Compute the risk budget of the level from the settings.
+    """Compute the risk budget of the protection level from the settings.
 
-    A fault is assumed to last as long as one independent error, a constellation fault for `CONSTELLATION_FAULT_S`. A
-    past fault affects the filter for `FORGOTTEN` more correlation times of codes, through errors in the state.
+    A constellation fault is assumed to last for `CONSTELLATION_FAULT_S`, any other fault as long as one independent
+    error. After its end, a fault still affects the state for `FORGOTTEN` code correlation times.
     """
     risk = limits.level_risk_per_hour / limits.level_samples_per_hour
     remembered_s = FORGOTTEN * constants.CODE_CORRELATION_S

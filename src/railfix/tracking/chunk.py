@@ -19,9 +19,9 @@ from railfix.tracking.epochs import GnssEpochs, Previous
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.state import TrackState
 
-#: Shortest interval between epochs [s].
+#: Minimum interval between epochs [s], also assumed for equal times: Dopplers and forces are divided by the interval.
 _SHORTEST_S: Final = 1e-3
-#: Longest interval over which the filter continues [s]; it restarts after a longer interval.
+#: Longest interval over which the filter continues [s]; the filter restarts after a longer interval.
 _APART_S: Final = 3600.0
 #: Minimum number of phases or Dopplers from which velocity and clock drift can be computed.
 _MOTION: Final = 4
@@ -45,7 +45,7 @@ class Chunk:
 
 
 def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> Chunk:
-    """Return the chunk, and add an unknown to the state for the error of each satellite observed in the chunk."""
+    """Return the chunk, and add the errors of newly observed satellites to the unknowns of the state."""
     state.origin = epochs.time[0] if np.isnat(state.origin) else state.origin
     phase, before = _previous(epochs.channel, state.previous)
     phase = np.concatenate([phase[None], epochs.phase_m])
@@ -62,7 +62,6 @@ def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits)
     if np.isnat(state.time):
         gap[:1] = 1.0
     apart = gap > _APART_S
-    # The interval is at least a millisecond, even for equal times, because Dopplers and forces are weighted by it.
     interval = np.maximum(gap, _SHORTEST_S)
     interval[apart] = 1.0
 
@@ -102,7 +101,7 @@ def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits)
 
 
 def _compute_variance(cn0_dbhz: Floats, code_sigma_m: Floats, limits: TrackingLimits) -> Floats:
-    """Return white-error variances of codes, and by C/N0 those of phase changes and Dopplers, shape (3, T, K)."""
+    """Return the white-error variances of codes, phase changes and Dopplers, shape (3, T, K)."""
     cn0 = np.where(np.isnan(cn0_dbhz), 45.0, np.minimum(cn0_dbhz, 50.0))
     weak = 10.0 ** ((45.0 - cn0) / 10.0)
     return np.array(
@@ -122,7 +121,7 @@ def compute_singer_step(dt: float, sigma_mps2: float, tau_s: float) -> tuple[Flo
 
 
 def _write_velocities(epoch: Records, channel: Records, near_ecef_m: Floats) -> None:
-    """Write velocities computed without the line; numba is imported here, so that only runs with a filter load it."""
+    """Write velocities computed without the line to the records `epoch`."""
     from railfix.kernels.tracking.velocity import write_velocities
 
     latitude, longitude, _ = geodetic_from_ecef(np.where(np.isfinite(near_ecef_m), near_ecef_m, 1e6))
@@ -131,7 +130,7 @@ def _write_velocities(epoch: Records, channel: Records, near_ecef_m: Floats) -> 
 
 
 def finish_chunk(chunk: Chunk, epochs: GnssEpochs, state: TrackState) -> None:
-    """Drop satellites unobserved for `FORGOTTEN` correlation times, and store the phases of the last epoch."""
+    """Store the last phases, and drop the errors of satellites not observed for `FORGOTTEN` correlation times."""
     phase = np.where(np.isfinite(epochs.phase_m[-1]), epochs.phase_m[-1], np.nan)
     state.previous = Previous(channel=epochs.channel, sat_ecef_m=epochs.sat_ecef_m[-1], phase_m=phase)
     kept = seconds(chunk.time[-1] - state.seen) <= FORGOTTEN * constants.CODE_CORRELATION_S
@@ -152,7 +151,7 @@ def _previous(channels: Strings, previous: Previous | None) -> tuple[Floats, Flo
 
 
 def _with_satellites(state: TrackState, satellite: Strings, measured: Masks) -> Indices:
-    """Add an unknown for each newly observed satellite; return each channel's satellite index, -1 if not observed."""
+    """Add an unknown per newly observed satellite, and return each channel's satellite index, -1 if not observed."""
     place = {name: k for k, name in enumerate(state.satellite.tolist())}
     names = satellite.tolist()
     new = [name for name in dict.fromkeys(satellite[measured].tolist()) if name not in place]

@@ -33,25 +33,25 @@ class GnssEpochs:
     time: Datetimes  #: Time of each epoch, shape (T,).
     satellite: Strings  #: Satellite of each channel, shape (K,).
     signal: Strings  #: Signal of each channel, shape (K,); satellite and signal identify a channel uniquely.
-    clock: Strings  #: Letter of the receiver clock of each channel's codes, shape (K,).
+    clock: Strings  #: Letter of the receiver clock that affects each channel's codes, shape (K,).
     sat_ecef_m: Floats  #: Satellite position at transmission, shape (T, K, 3).
     sat_velocity_mps: Floats  #: Satellite velocity at transmission, shape (T, K, 3).
     code_m: Floats  #: Pseudorange corrected for satellite clock, group delay and atmosphere, shape (T, K).
     code_sigma_m: Floats  #: Standard deviation of the code, including the receiver's noise scale, shape (T, K).
     phase_m: Floats  #: Carrier phase corrected for satellite clock and troposphere, shape (T, K).
     phase_joined: Masks  #: True where the phase continues from the previous epoch without a cycle slip, shape (T, K).
-    #: Range rate from the Doppler, positive for an increasing range, shape (T, K). The rate may include the satellite
-    #: clock drift and the tropospheric rate, some millimetres per second each.
+    #: Range rate from the Doppler, positive for an increasing range, shape (T, K). It need not be corrected for
+    #: satellite clock drift and tropospheric rate, some millimetres per second each.
     rate_mps: Floats
     cn0_dbhz: Floats  #: Carrier-to-noise density, shape (T, K).
     #: True where the train is known to be away from the line, shape (T,). At these epochs the filter is reset, and no
     #: measurement is used.
     off_map: Masks
-    #: Error of the ionospheric model divided by the error in a quiet ionosphere, shape (T,). Values above 1 widen sigma
-    #: and level; 0 is for ionosphere-free codes; None stands for 1.
+    #: Error of the ionospheric model divided by its error in a quiet ionosphere, shape (T,); None for 1. Values above 1
+    #: increase sigma and protection level. The value is 0 for ionosphere-free codes.
     tilt_scale: Floats | None = None
-    #: Position computed without the line, accurate to some hundred metres, shape (T, 3). The velocity across the line
-    #: is computed at this position, and is not used where the position is NaN or None.
+    #: Position computed without the line, accurate to some hundred metres, shape (T, 3). The antenna velocity is
+    #: computed at this position, and is not available where the position is NaN or None.
     near_ecef_m: Floats | None = None
 
     def __len__(self) -> int:
@@ -78,7 +78,7 @@ class RangeEpochs:
     sigma_m: Floats  #: Standard deviations of the ranges, shape (T, R).
     age_s: Floats  #: Ages of the ranges at the epoch, shape (T, R).
     unit_ecef_m: Floats  #: Position of each range's ground unit, shape (T, R, 3).
-    #: Lever arm from the trajectory to the unit on the vehicle: along increasing arc length, right and up, shape (3,).
+    #: Lever arm from the trajectory to the vehicle's ranging unit: forward along the line, right, up, shape (3,).
     lever_m: Floats
 
     def take(self, rows: Indices) -> RangeEpochs:
@@ -91,8 +91,8 @@ class RangeEpochs:
 class BaliseEpochs:
     """Balises read since the previous epoch, in two alternating columns; NaN where absent."""
 
-    time: Datetimes  #: Time at which each balise was passed, shape (T, 2); arbitrary where absent.
-    place_m: Floats  #: Arc length of the train along the trajectory at this time, shape (T, 2).
+    time: Datetimes  #: Time at which each balise was passed, shape (T, 2); arbitrary where no balise was read.
+    place_m: Floats  #: Arc length of the train along the trajectory at `time`, shape (T, 2).
     sigma_m: Floats  #: Standard deviation of the arc length, shape (T, 2).
 
     @classmethod
@@ -123,9 +123,9 @@ class SensorEpochs:
 
     wheel_m: Floats | None = None  #: Wheel distance since the previous epoch, positive toward increasing chainage.
     wheel_sigma_m: Floats | None = None  #: Standard deviation of the wheel distance.
-    #: Whether the wheel distance has a sign. If "unknown", the filter assigns the sign of the speed.
+    #: "unknown" if the wheel distance has no sign. The filter then assigns the sign of the speed.
     wheel_sign: Literal["measured", "unknown"] = "measured"
-    #: Radar distance since the previous epoch. Oscillations of the body cancel in a distance (P2 3.2).
+    #: Radar distance since the previous epoch. Oscillations of the vehicle body cancel in a distance (P2 3.2).
     radar_m: Floats | None = None
     radar_sigma_m: Floats | None = None
     #: Mean specific force toward increasing chainage since the previous epoch, including gravity on the gradient.

@@ -1,6 +1,6 @@
-"""Filter along the track, which estimates positions along the trajectory from epochs and the previous state.
+"""Along-track filter: positions along the trajectory from epochs of measurements and the previous state.
 
-`railfix.kernels.tracking.layout` defines the arrays, `railfix.kernels.tracking.recursion` the recursion over epochs.
+`railfix.kernels.tracking.layout` defines the arrays, and `railfix.kernels.tracking.recursion` the recursion.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ class Step:
 
     dt: float  #: Interval since the previous epoch [s].
     satellite: Strings  #: Satellites whose errors are in the state, shape (N - ix.SATELLITES,).
-    trace: Trace | None = None  #: Measurements and restarts of the epoch; None without a hypothesis.
+    trace: Trace | None = None  #: Measurements and restarted unknowns of the epoch; None without a hypothesis.
     #: Means and covariances after the epoch, shapes (H, N) and (H, N, N).
     mean: Floats = field(default_factory=lambda: np.empty((0, 0)))
     covariance: Floats = field(default_factory=lambda: np.empty((0, 0, 0)))
     #: Index of each hypothesis at the previous epoch, shape (H,); -1 for a new hypothesis.
     parent: Indices = field(default_factory=lambda: np.empty(0, dtype=np.intp))
-    splits: list[SplitHypothesis | None] | None = None  #: `Sought.splits`.
-    tilt_scale: float = 1.0  #: `GnssEpochs.tilt_scale`.
+    splits: list[SplitHypothesis | None] | None = None  #: As `Sought.splits`.
+    tilt_scale: float = 1.0  #: As `GnssEpochs.tilt_scale`.
 
 
 class Recursion:
-    """Kernel inputs of a chunk; `start_state` is the state before the chunk, as modified by `prepare_chunk`."""
+    """Kernel inputs and results of a chunk; `start_state` is the initial state, as modified by `prepare_chunk`."""
 
     def __init__(
         self, chunk: Chunk, line: Line, sensors: SensorEpochs, limits: TrackingLimits, start_state: TrackState, *,
@@ -61,7 +61,7 @@ class Recursion:
         )  # fmt: skip
 
     def seek(self, state: TrackState, epoch: int, reasons: int, trace: list[Step] | None) -> Sought | None:
-        """Search positions for an epoch to which the hypotheses have been predicted.
+        """Search for positions at an epoch to which the hypotheses have already been predicted.
 
         If no hypothesis exists after the search, finish the epoch and return None.
         """
@@ -79,8 +79,8 @@ class Recursion:
     def run(self, state: TrackState, first: int, found: Sought | None, trace: list[Step] | None) -> tuple[int, int]:
         """Process epochs from `first` on, and update the state.
 
-        Returns the next epoch, and the reasons for a position search before the next epoch (0 for none). Only the epoch
-        `first` is processed if its positions have been `found`, or if a `trace` is required.
+        Only the epoch `first` is processed if `found` is the result of a position search at this epoch, or if a `trace`
+        is required. Return the index of the next epoch, and the reasons for a position search there (0 for none).
         """
         count, width = state.mean.shape
         last = len(self.chunk.time) if trace is None and found is None else first + 1
@@ -128,10 +128,11 @@ def track(
     levels: bool = False,
     trace: list[Step] | None = None,
 ) -> tuple[Tracked, TrackState]:
-    """Estimate the position at each epoch from this and all earlier epochs (motion model: R. A. Singer, 1970).
+    """Estimate the position at each epoch from measurements up to this epoch (motion model: R. A. Singer, 1970).
 
-    The equations are in docs/filter-equations.md, the compiled recursion in `railfix.kernels.tracking.recursion`. With
-    ``NUMBA_DISABLE_JIT=1`` in the environment, the same code runs as plain Python for debugging.
+    The equations are in docs/filter-equations.md; the compiled recursion is `railfix.kernels.tracking.recursion`.
+    Results are the same whether epochs are processed in one call or in several. With ``NUMBA_DISABLE_JIT=1`` in the
+    environment, the same code runs as plain Python for debugging.
 
     Parameters
     ----------
@@ -143,8 +144,7 @@ def track(
     limits : TrackingLimits, optional
     sensors : SensorEpochs, optional
     levels : bool
-        Whether a bank of sub-filters computes a protection level at every epoch (`railfix.tracking.levels` does so at a
-        lower rate).
+        If True, sub-filters compute a protection level at every epoch (`railfix.tracking.levels` uses a lower rate).
     trace : list of Step, optional
         List to which the record of each epoch is appended for the smoother (`railfix.tracking.smoother`).
 
@@ -152,7 +152,7 @@ def track(
     -------
     Tracked
     TrackState
-        State for the next epochs. Results are the same whether epochs are processed in one call or in several.
+        State for the next epochs.
     """
     limits, sensors = limits or TrackingLimits(), sensors or SensorEpochs()
     state = TrackState() if state is None else copy_with(state)

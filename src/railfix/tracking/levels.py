@@ -1,8 +1,8 @@
-"""Protection level of the filtered position at every epoch, from a second filter with sub-filters at a lower rate.
+"""Protection level at every epoch, from a second filter with sub-filters that runs at a lower rate.
 
 The sub-filters, at least one per satellite (`railfix.tracking.bank`), require much computing time, and codes of
 neighbouring epochs have nearly the same errors. The second filter therefore processes only one epoch per
-`level_period_s`, by default 1 s. The equations that propagate the level to the other epochs are in
+`level_period_s`, by default 1 s. The equations that propagate the protection level to other epochs are in
 docs/filter-equations.md.
 """
 
@@ -27,10 +27,10 @@ from railfix.tracking.state import TrackState
 #: Sensors whose values between two selected epochs are accumulated.
 _SUMMED: Final = (("wheel_m", "wheel_sigma_m"), ("radar_m", "radar_sigma_m"), ("force_mps2", "force_sigma_mps2"))
 _MEAN: Final = np.array([False, False, True])  #: True for sensors whose values are averaged, not summed.
-#: Largest separation of a sub-filter that noise explains, in standard deviations: for positions without a level, and
-#: for positions with a level. A sub-filter that excludes a faulty satellite has a larger separation.
+#: Largest difference between filter and sub-filter that noise alone explains, in standard deviations of the filtered
+#: position: for positions without a protection level, and for positions with one.
 _EXPLAINED: Final = (3.0, 4.0)
-#: Larger levels count as infinite [m], because they result from a sub-filter without measurements.
+#: Largest finite protection level [m]. Larger ones result from sub-filters without measurements, and become infinite.
 LARGEST_LEVEL_M: Final = 1000.0
 _KEPT: Final = (
     "arc_m", "speed_mps", "level_m", "ground_level_m", "level_noise_m", "level_speed_mps", "separation_m",
@@ -44,7 +44,7 @@ class AccumulatedIncrement:
 
     #: Time of the first epoch. An epoch is selected where the rounded number of periods since `start` increases.
     start: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    number: int = -1  #: Number of periods from `start` to the last selected epoch; -1 before the first.
+    number: int = -1  #: Number of periods from `start` to the last selected epoch; -1 before the first selected epoch.
     epochs: int = 0  #: Number of epochs since the last selected epoch.
     #: Channels whose carrier phase has continued since the last selected epoch; None if no epoch has followed.
     unbroken: frozenset[str] | None = None
@@ -57,11 +57,14 @@ class AccumulatedIncrement:
 def decimate_epochs(
     epochs: GnssEpochs, sensors: SensorEpochs, since: AccumulatedIncrement, period_s: float
 ) -> tuple[Indices, GnssEpochs | None, SensorEpochs, AccumulatedIncrement]:
-    """Select one epoch per period; return indices and measurements of these epochs, and the remainder after the last.
+    """Select one epoch per period.
 
-    A carrier phase must continue at all epochs between two selected epochs. Distances between selected epochs are
-    summed, forces averaged, and balises assigned to the next selected epoch. Positions from features and ranges to
-    ground units are used at selected epochs only. `since` is the remainder of the previous chunk.
+    Return the indices, the GNSS measurements and the sensor measurements of the selected epochs, and the measurements
+    accumulated after the last selected epoch. `since` has the measurements accumulated in the previous chunk.
+
+    A carrier phase is used only if it continued through all epochs since the previous selected epoch. Distances between
+    selected epochs are summed, forces are averaged, and balises are assigned to the next selected epoch. Positions from
+    features and ranges to ground units are used at selected epochs only.
     """
     if not len(epochs):
         return np.empty(0, dtype=np.intp), None, SensorEpochs(), since
@@ -70,8 +73,8 @@ def decimate_epochs(
     before = np.maximum.accumulate(np.concatenate([[since.number], number]))
     taken = (before[1:] > before[:-1]).nonzero()[0]
     value, variance = _columns(sensors, len(epochs))
-    # Row 0 is the remainder of the previous chunk, row t + 1 is epoch t. An interval ends with a selected epoch: if
-    # epochs 1 and 3 of five are selected, the intervals are rows 0 to 2 and 3 to 4, and row 5 remains.
+    # Row 0 is the sum from the previous chunk, row t + 1 is epoch t. An interval ends with a selected epoch: if epochs
+    # 1 and 3 of epochs 0 to 4 are selected, the intervals are rows 0 to 2 and 3 to 4, and row 5 remains.
     goes_on = np.ones((len(epochs) + 1, len(epochs.channel)), dtype=np.bool_)
     if since.unbroken is not None:
         goes_on[0] = [name in since.unbroken for name in epochs.channel.tolist()]
@@ -108,7 +111,7 @@ def decimate_epochs(
 
 
 def _columns(sensors: SensorEpochs, epochs: int) -> tuple[Floats, Floats]:
-    """Return values and variances of the accumulated sensors `_SUMMED`, shape (T, 3); NaN without a sensor."""
+    """Return the values and variances of the sensors in `_SUMMED`, shape (T, 3); NaN for a missing sensor."""
     value, variance = np.full((epochs, 3), np.nan), np.full((epochs, 3), np.nan)
     for column, (name, sigma) in enumerate(_SUMMED):
         if getattr(sensors, name) is not None:
@@ -132,7 +135,7 @@ class LevelState:
     """State of the filter with sub-filters after a chunk."""
 
     track: TrackState | None = None
-    every: bool = True  #: True as long as this filter has used every epoch, so that it equals the main filter.
+    every: bool = True  #: True while this filter has used every epoch and so equals the main filter.
     since: AccumulatedIncrement = field(default_factory=AccumulatedIncrement)
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Last epoch of this filter.
     #: Results `_KEPT` of this filter at its last epoch, shape (10,); NaN before the first epoch.
@@ -173,11 +176,11 @@ def carried_levels(
     state: LevelState,
     limits: TrackingLimits,
 ) -> tuple[Tracked, LevelState]:
-    """Return the main filter's positions, with levels propagated from the epochs at which the second filter ran.
+    """Return the main filter's results, with protection levels propagated from the epochs of the second filter.
 
-    `tracked` are the main filter's results. `taken` are the indices of the epochs at which the second filter, which has
-    sub-filters, ran. `with_bank` are the second filter's results at these epochs (None without such epochs), and
-    `state` is the state of the second filter before the chunk.
+    `tracked` are the main filter's results. The second filter, which has sub-filters, ran at the epochs `taken`, with
+    the results `with_bank` (None without such epochs). `state` is the second filter's state before the chunk; its state
+    after the chunk is returned, too.
     """
     number = taken.searchsorted(np.arange(len(tracked)), side="right")
     times, values = np.array([state.time]), state.values[None]
@@ -188,7 +191,7 @@ def carried_levels(
     arc, speed, level, ground, noise, of_speed, separation, unchecked, amount, status = values[number].T
     tau = seconds(tracked.time - times[number])  # NaN before the first epoch of the second filter
     carried = line.nearest_m(arc, tracked.arc_m) + speed * tau
-    # Growth of the position error since the second filter's last epoch: V tau + a tau^2 / 2.
+    # Growth of the position error since the second filter's last epoch: V tau + a tau^2 / 2, with the speed bound V.
     growth_m = of_speed * tau + 0.5 * limits.level_acceleration_mps2 * tau**2
     known = np.isfinite(tracked.arc_m)
 
@@ -203,7 +206,8 @@ def carried_levels(
     level = np.where(bounded | ~known, widened(level, np.abs(tracked.arc_m - carried)), np.inf)
     amount = np.fmax(level, amount + constants.SCALE_BOUND * np.abs(speed) * tau)
     reported = _status(tracked.status, status, level)
-    # If doubtful, sigma includes the largest separation; otherwise, only the part that noise does not explain.
+    # Sigma of a doubtful position includes the whole of the largest separation; other sigmas include only the part of
+    # the separation that noise does not explain.
     doubt = (reported == TrackStatus.DOUBTFUL) | ~np.isfinite(ground)
     explained = np.where(is_bounded(reported), _EXPLAINED[1], _EXPLAINED[0]) * tracked.sigma_m
     apart = np.where(np.isnan(separation), 0.0, separation)
@@ -219,12 +223,12 @@ def carried_levels(
 
 
 def _useful(level_m: Floats) -> Floats:
-    """Return the levels, infinite above `LARGEST_LEVEL_M`."""
+    """Return the protection levels, with infinity for values above `LARGEST_LEVEL_M`."""
     return np.where(level_m > LARGEST_LEVEL_M, np.inf, level_m)
 
 
 def _status(status: Codes, of_level: Floats, level_m: Floats) -> Codes:
-    """Return the statuses of positions; a position without a finite level is neither tracking nor coasting."""
+    """Replace the statuses `TRACKING` and `COASTING` of positions without a finite protection level."""
     reason = np.where(np.isfinite(of_level), of_level, TrackStatus.DOUBTFUL).astype(np.int8)
     reason = np.where(is_bounded(reason), np.int8(TrackStatus.DOUBTFUL), reason)
     return np.where(is_bounded(status) & ~np.isfinite(level_m), reason, status).astype(np.int8)

@@ -1,4 +1,4 @@
-"""Trajectory as used by the filter: points, smooth tangents and axes at any arc length, even beyond the ends."""
+"""Trajectory as used by the filter: points and smooth axes at any arc length, even beyond the ends."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from railfix.kernels.tracking.layout import LINE, VERTEX, Records
 from railfix.ranges.atmosphere import geomagnetic_latitude
 from railfix.track.trajectory import Trajectory
 
-#: Standard deviation of the displacement along the line by a tilted ionosphere, by geomagnetic latitude [m]: 2/9 of the
-#: vertical-delay sigma without SBAS in DO-229D J.2.3, which is 9 m up to 20 deg, 4.5 m up to 55 deg, and 6 m beyond. At
-#: middle latitudes the displacement equals `slow_code_m`. `GnssEpochs.tilt_scale` multiplies both sigmas at each epoch.
+#: Standard deviation of the displacement along the line by a horizontal gradient of the ionosphere [m], for geomagnetic
+#: latitudes up to 20 deg, up to 55 deg, and beyond. It is 2/9 of the vertical-delay sigma without SBAS in DO-229D
+#: J.2.3, which is 9 m, 4.5 m and 6 m. `GnssEpochs.tilt_scale` multiplies this sigma and `slow_code_m` at each epoch.
 TILT_M: Final = (2.0, 1.0, 1.33)
 _TILT_LATITUDES_DEG: Final = (20.0, 55.0)
 
 
 class Line:
-    """Trajectory of V points with smooth axes, continued straight beyond the ends or, if closed, along the loop."""
+    """Trajectory of V points with smooth axes. Open lines continue straight at their ends, closed lines as a loop."""
 
     def __init__(self, trajectory: Trajectory) -> None:
         self.trajectory = trajectory
@@ -34,7 +34,7 @@ class Line:
 
     @cached_property
     def axes(self) -> Floats:
-        """Axes at the points, shape (V, 3, 3), with the rows tangent (mean of two segments), right and up."""
+        """Axes at the points, shape (V, 3, 3), with the rows tangent (mean direction of two segments), right and up."""
         segment, up = self.segment, self.trajectory.up
         tangent = np.concatenate([segment[:1], segment[:-1] + segment[1:], segment[-1:]])
         tangent = tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -50,8 +50,7 @@ class Line:
     def at(self, arc_m: Floats) -> tuple[Floats, Floats]:
         """Return points [m], shape (H, 3), and axes, shape (H, 3, 3), at arc lengths [m], shape (H,).
 
-        A closed line is continued along its loop, an open line straight beyond its ends. The rows of the axes are
-        tangent, right and up, interpolated between vertices.
+        The rows of the axes are tangent, right and up, interpolated between vertices.
         """
         arc_m = arc_m + self.round_m(arc_m) if self.closed else arc_m
         index = self.arc_m[1:-1].searchsorted(arc_m, side="right")
@@ -67,7 +66,7 @@ class Line:
         return bool(np.isfinite(self.joins_m).any())
 
     def round_m(self, arc_m: Floats) -> Floats:
-        """Return the shift [m] that moves positions beyond an end of a closed line back onto it; 0 for others."""
+        """Return the shift [m] that moves positions beyond an end of a closed line back onto the line; 0 for others."""
         back = np.zeros(np.shape(arc_m))
         first, last = self.arc_m[0], self.arc_m[-1]
         for excess, turn in ((arc_m - last, last - self.joins_m[1]), (first - arc_m, first - self.joins_m[0])):
@@ -76,7 +75,7 @@ class Line:
         return back
 
     def nearest_m(self, arc_m: Floats, to_m: Floats) -> Floats:
-        """Return arc lengths, shifted by whole laps of a closed line so that they are nearest to `to_m` [m]."""
+        """Return arc lengths [m], on a closed line shifted by whole laps so that they are nearest to `to_m` [m]."""
         if not self.closed:
             return arc_m
         back = self.round_m(to_m)
@@ -93,7 +92,7 @@ class Line:
 
     @cached_property
     def records(self) -> tuple[Records, Records]:
-        """Records of the vertices and of the line for the recursion, shapes (V,) and (1,)."""
+        """Records of the vertices, shape (V,), and of the line, shape (1,), for the recursion."""
         vertex, line = np.zeros(len(self.arc_m), dtype=VERTEX), np.zeros(1, dtype=LINE)
         for name in ("arc_m", "ecef_m", "axes"):
             vertex[name] = getattr(self, name)
@@ -109,7 +108,7 @@ class Line:
         return vertex, line
 
     def gradient_at(self, arc_m: Floats) -> Floats:
-        """Return the gradient, climb divided by horizontal length, interpolated between segment middles, shape (H,)."""
+        """Return the gradient at arc lengths [m], interpolated between segment middles, shape (H,)."""
         arc_m = arc_m + self.round_m(arc_m) if self.closed else arc_m
         return np.interp(arc_m, self._middle_m, self.gradient)
 

@@ -1,4 +1,4 @@
-"""Conversion of state, settings and sensors to arrays of the recursion, and of resulting arrays to a state."""
+"""Conversion of state, settings and sensor measurements to arrays of the recursion, and of its results to a state."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _BRANCH_SIGMAS = 3.0
 
 @lru_cache(maxsize=8)
 def pack_parameters(limits: TrackingLimits, sigma_plan_m: float) -> Records:
-    """Return a record, shape (1,), of the numeric settings and the risk budget of the level."""
+    """Return a record, shape (1,), of the numeric settings and the risk budget of the protection level."""
     budget = bank.budget(limits)
     values = {name: value for name, value in dict(limits).items() if isinstance(value, (int, float))}
     values["map_branch_m"] = max(constants.MAP_BRANCH_M, _BRANCH_SIGMAS * sigma_plan_m)
@@ -67,7 +67,7 @@ def list_sources(state: TrackState) -> list[str]:
 
 
 def pack_state(state: TrackState, limits: TrackingLimits, *, levels: bool) -> layout.State:
-    """Return a copy of the state as arrays of the recursion; without `levels`, no sub-filters are included."""
+    """Return a copy of the state as arrays of the recursion. Sub-filters are included only if `levels` is True."""
     names = list_sources(state) if levels else []
     count, width = state.mean.shape
     x, P = np.zeros((count + len(names), width)), np.zeros((count + len(names), width, width))

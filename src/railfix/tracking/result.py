@@ -13,14 +13,14 @@ from railfix.kernels.tracking.index import TrackStatus as TrackStatus
 from railfix.kernels.tracking.layout import Results, record_of
 from railfix.tracking.epochs import Kind
 
-#: Statuses in which the level bounds the error. Sub-filters do not bound the error of a train away from the map, on one
-#: of several branches or on a doubtful track.
+#: Statuses in which the protection level bounds the error. The error is not bounded away from the map, with several
+#: possible branches, or on a doubtful track.
 BOUNDED: Final = (TrackStatus.TRACKING, TrackStatus.COASTING)
 _IS_BOUNDED: Final = np.array([status in BOUNDED for status in TrackStatus])
 
 
 def is_bounded(status: Codes) -> Masks:
-    """Return the mask of statuses in `BOUNDED`, same shape."""
+    """Return True for statuses in `BOUNDED`, same shape."""
     return np.asarray(_IS_BOUNDED[status])
 
 
@@ -29,9 +29,9 @@ class Tracked(NotebookTable):
     """Filter results of T epochs with K channels; NaN where unknown."""
 
     time: Datetimes  #: Time of each epoch, shape (T,).
-    status: Codes  #: `TrackStatus`, shape (T,).
+    status: Codes  #: Values of `TrackStatus`, shape (T,).
     #: Arc length and standard deviation of the most probable hypothesis, shape (T,). The standard deviation includes
-    #: the straight distance to the other hypotheses, and separations that noise does not explain.
+    #: the straight distance to other hypotheses, and differences from sub-filters that noise does not explain.
     arc_m: Floats
     sigma_m: Floats
     speed_mps: Floats  #: Speed along the line, shape (T,).
@@ -39,31 +39,32 @@ class Tracked(NotebookTable):
     acceleration_mps2: Floats  #: Acceleration along the line, shape (T,).
     probability: Floats  #: Probability of the reported hypothesis, shape (T,).
     hypotheses: Integers  #: Number of hypotheses, shape (T,).
-    code_weight: Floats  #: Mean weight of the codes that are not left out, shape (T,).
+    code_weight: Floats  #: Mean weight of the codes that are not excluded, shape (T,).
     motion_weight: Floats  #: Mean weight of Dopplers and phases, shape (T,).
     wheel_scale: Floats  #: Estimated scale-factor error of the wheel, shape (T,).
     force_offset_mps2: Floats  #: Estimated accelerometer offset, shape (T,).
     radar_scale: Floats  #: Estimated scale-factor error of the radar, shape (T,).
-    map_scale: Floats  #: Factor on the error of map lengths, shape (T,); 1 if codes do not contradict the map lengths.
+    #: Factor on the assumed error of map lengths, shape (T,); 1 if codes do not contradict the map lengths.
+    map_scale: Floats
     level_m: Floats  #: Protection level of the error along the line, shape (T,); NaN where levels are off.
-    #: Protection level of the straight distance, which includes all branches and a laterally displaced map, shape (T,).
+    #: Protection level of the straight distance, shape (T,), including other branches and lateral errors of the map.
     ground_level_m: Floats
-    level_noise_m: Floats  #: Protection level of the fault-free noise of a single branch, shape (T,).
-    #: Bound of the speed error, used to propagate the level to the next epochs, shape (T,).
+    level_noise_m: Floats  #: Protection level of a single branch for noise without faults, shape (T,).
+    #: Bound of the speed error, used to propagate protection levels to later epochs, shape (T,).
     level_speed_mps: Floats
-    #: Largest separation of a sub-filter, shape (T,); NaN where levels are off.
+    #: Largest difference between filter and sub-filter, shape (T,); NaN where levels are off.
     separation_m: Floats
-    #: Probability of faults that the level does not bound, such as a fault of the only constellation; shape (T,).
+    #: Probability of faults that the level does not bound, such as a fault of the only constellation, shape (T,).
     unchecked_prior: Floats
-    #: Over- and under-reading amount (SUBSET-026 3.6.8), shape (T,): the level, but at least the scale bound times the
-    #: distance since codes were used.
+    #: Over- and under-reading amount (SUBSET-026 3.6.8), shape (T,): the protection level, but at least the bound of
+    #: the scale error times the distance since codes were last used.
     amount_m: Floats
     used: Integers  #: Number of measurements of each kind with a weight above a half, shape (T, len(Kind)).
     innovation: Floats  #: Innovations of codes, phase changes and Dopplers, shape (T, 3, K).
-    #: Innovations of the sensors in the order of `Kind`, shape (T, len(Kind) - 3); for several ranges, the last.
+    #: Innovations of the sensors in the order of `Kind`, shape (T, len(Kind) - 3); the last one of several ranges.
     sensed: Floats
-    weight: Floats  #: Weights of codes, phase changes and Dopplers, shape (T, 3, K); 0 for codes that are left out.
-    faulty: Masks  #: True for codes that are left out (`railfix.kernels.tracking.adaptation`), shape (T, K).
+    weight: Floats  #: Weights of codes, phase changes and Dopplers, shape (T, 3, K); 0 for excluded codes.
+    faulty: Masks  #: True for excluded codes (`railfix.kernels.tracking.adaptation`), shape (T, K).
 
     def __len__(self) -> int:
         return len(self.time)
@@ -75,7 +76,7 @@ class Tracked(NotebookTable):
 
     @classmethod
     def from_records(cls, time: Datetimes, results: Results) -> Tracked:
-        """Return the results from the records of the recursion."""
+        """Convert the result records of the recursion."""
         columns = {name: np.ascontiguousarray(results.epoch[name]) for name in EPOCH_RESULT.names or ()}
         columns |= {
             name: np.ascontiguousarray(np.moveaxis(results.channel[name], -1, 1)) for name in ("innovation", "weight")
@@ -83,12 +84,12 @@ class Tracked(NotebookTable):
         return cls(time=time, **columns, faulty=np.ascontiguousarray(results.channel["faulty"]))
 
 
-#: Types of the columns.
+#: Data types of the columns.
 _TYPES: Final = {"Codes": np.int8, "Integers": np.int64, "Floats": np.float64}
 #: Shapes of columns with more than one number per epoch.
 _SHAPES: Final = {"used": (len(Kind),), "sensed": (len(Kind) - 3,)}
 _OF_CHANNELS: Final = ("innovation", "weight", "faulty")
-#: Record types of one epoch and of one channel of `Tracked` in the recursion.
+#: Record types of the results of one epoch and of one channel in the recursion.
 EPOCH_RESULT: Final = record_of({
     f.name: (_TYPES[str(f.type)], _SHAPES.get(f.name, ()))
     for f in fields(Tracked)

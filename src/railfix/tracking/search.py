@@ -1,4 +1,4 @@
-"""Position search from the codes of an epoch: at the start, after gaps and after a loss of track."""
+"""Position search from the codes of one epoch: at the start, after gaps and after a loss of track."""
 
 from __future__ import annotations
 
@@ -20,30 +20,30 @@ from railfix.tracking.state import ANY_SPEED, HYPOTHESIS, TrackState
 #: Largest spacing of the points at which the line is searched [m]. A Gaussian of `START_SIGMA_M` covers the positions
 #: between two points, and the code variance includes the distance to the nearest point.
 _SPACING_M: Final = 15.0
-#: Minimum redundancy of codes for a search. With a single redundant code, a wrong position can fit equally well.
+#: Minimum number of redundant codes for a search. A wrong position can fit a single redundant code equally well.
 REDUNDANT: Final = 2
-#: Largest difference from the maximum log likelihood with which a position becomes a hypothesis.
+#: A position becomes a hypothesis only if its log likelihood is within this difference of the maximum.
 _WORSE: Final = 25.0
 _ANY_SPEED_MPS: Final = 50.0  #: Prior standard deviation of the speed [m/s]; no train is faster than twice this speed.
 _ANY_DRIFT_MPS: Final = 1e3  #: Prior standard deviation of the clock drift [m/s].
-_FIRST_STEP_M: Final = 1.0  #: Standard deviation of the map displacement over the interval before the first epoch [m].
+_FIRST_STEP_M: Final = 1.0  #: Standard deviation of the map displacement before the first epoch [m].
 WHEEL_PRIOR: Final = 0.02  #: Prior standard deviation of the wheel's scale-factor error.
 FORCE_PRIOR_MPS2: Final = 0.1  #: Prior standard deviation of the accelerometer offset, including the mounting.
 RADAR_PRIOR: Final = 0.02  #: Prior standard deviation of the radar's scale-factor error.
 _BESIDE_STEPS: Final = np.array([-2.0, -1.0, 1.0, 2.0])  #: Distances to neighbouring hypotheses, in units of `BEND_M`.
-_BESIDE: Final = len(_BESIDE_STEPS)  #: Number of neighbouring hypotheses that are added to a hypothesis.
+_BESIDE: Final = len(_BESIDE_STEPS)  #: Number of neighbouring hypotheses per hypothesis.
 _BEND_SPEED_MPS: Final = 10.0  #: Standard deviation added to the speed of neighbouring hypotheses [m/s].
-#: Total probability of the neighbouring hypotheses as a fraction of the probability of the hypothesis.
+#: Total probability of the neighbours of a hypothesis, as a fraction of its probability.
 _BESIDE_SHARE: Final = 0.01
-#: Unknowns that a new hypothesis takes from a lost track; the position error of the track affects all other unknowns.
+#: Unknowns that a new hypothesis copies from a lost track. Other unknowns are affected by the track's position error.
 _KEPT: Final = np.array([ix.WHEEL, ix.FORCE_OFFSET, ix.RADAR])
 
 
 def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> Floats:
-    """Return the arc lengths that are consistent with the codes of an epoch, the most likely first, shape (C,) [m].
+    """Return the arc lengths [m] that are consistent with the codes of an epoch, the most likely first, shape (C,).
 
-    The positions are maxima of the likelihood with Student's t errors, more than `start_separation_m` apart. The result
-    is empty with fewer than `REDUNDANT` redundant codes.
+    The positions are maxima of the likelihood with Student's t errors, more than `start_separation_m` apart. With fewer
+    than `REDUNDANT` redundant codes, no position is returned.
     """
     channel = chunk.channel[epoch]
     has = channel["has"][:, ix.CODE] != 0
@@ -83,10 +83,10 @@ def begin(
     arc_m: Floats, satellites: int, line: Line, limits: TrackingLimits, *, sigma_m: float = constants.START_SIGMA_M,
     known: tuple[Floats, Floats] | None = None,
 ) -> tuple[Floats, Floats]:  # fmt: skip
-    """Return means (H, N) and covariances (H, N, N) of new hypotheses at positions `arc_m`, shape (H,).
+    """Return means, shape (H, N), and covariances, shape (H, N, N), of new hypotheses at `arc_m` [m], shape (H,).
 
-    `satellites` is the number of satellite errors in the state. `known` are mean (N,) and covariance (N, N) of a lost
-    track. The sensor unknowns of this track are kept; clocks and satellite errors restart.
+    `satellites` is the number of satellite errors in the state. `known` are the mean and covariance of a lost track,
+    whose sensor errors are kept. Clocks and satellite errors restart.
     """
     width = ix.SATELLITES + satellites
     mean = np.zeros((len(arc_m), width))
@@ -98,7 +98,7 @@ def begin(
     variance[:, ix.DRIFT] = _ANY_DRIFT_MPS**2
     variance[:, ix.MAP_RIGHT] = line.sigma_plan_m**2
     variance[:, ix.MAP_UP] = line.sigma_height_m**2
-    # without a prediction before the first epoch, the map displacement over the interval is almost unknown
+    # before the first epoch no position is known, so that the map displacement since then is almost unknown
     variance[:, [ix.STEP_RIGHT, ix.STEP_UP, ix.MAP_LENGTH_ERROR]] = _FIRST_STEP_M**2
     variance[:, ix.SLOW_CODE] = limits.slow_code_m**2
     variance[:, ix.DOPPLER_SPEED] = constants.DOPPLER_ERROR_MPS**2
@@ -117,7 +117,7 @@ def begin(
     return mean, covariance
 
 
-#: Probability of other positions if the velocity contradicts the only position; the cause may be a wrong map.
+#: Probability of other positions if the velocity contradicts the position; low, because a wrong map may be the cause.
 _ELSEWHERE: Final = 0.01
 
 
@@ -125,19 +125,19 @@ _ELSEWHERE: Final = 0.01
 class SplitHypothesis:
     """Narrow hypothesis that was split from a wide hypothesis."""
 
-    parent: int  #: Index of the wide hypothesis.
+    parent: int  #: Index of the wide hypothesis before the split.
     #: Mean and covariance of the wide hypothesis, shapes (N,) and (N, N).
     mean: Floats
     covariance: Floats
-    place_m: float  #: Arc length of the narrow hypothesis, with the standard deviation `START_SIGMA_M`.
+    place_m: float  #: Arc length of the narrow hypothesis; its standard deviation is `START_SIGMA_M`.
 
 
 class Sought(NamedTuple):
     """Result of the position search before an epoch."""
 
-    lost: bool  #: True if the track was lost.
+    lost: bool  #: True if the search followed a loss of track.
     parent: Indices  #: Index of each hypothesis at the previous epoch, shape (H,); -1 for a new hypothesis.
-    #: Split that produced each hypothesis, None for other hypotheses; None if no hypothesis was split.
+    #: Split that produced each hypothesis (None for other hypotheses), or None if no hypothesis was split.
     splits: list[SplitHypothesis | None] | None
 
 
@@ -146,22 +146,22 @@ _Part: TypeAlias = tuple[Floats, Floats, Records]
 
 
 def _new_records(log_probability: Floats, origin_m: Floats, log_code: Floats | float = 0.0) -> Records:
-    """Return the `HYPOTHESIS` records of new hypotheses, shape (H,) as the arguments."""
+    """Return the `HYPOTHESIS` records of new hypotheses, shape (H,)."""
     records = np.zeros(len(origin_m), dtype=HYPOTHESIS)
     records["log_probability"], records["origin_m"], records["log_code"] = log_probability, origin_m, log_code
     return records
 
 
 def _join(state: TrackState, parts: list[_Part]) -> None:
-    """Set the hypotheses of the state to all `parts`, and normalise their probabilities to a sum of 1."""
+    """Replace the hypotheses of the state by those of all `parts`, and normalise their probabilities to a sum of 1."""
     state.mean, state.covariance, state.hypothesis = (np.concatenate(items) for items in zip(*parts, strict=True))
     state.hypothesis["log_probability"] -= np.logaddexp.reduce(state.hypothesis["log_probability"])
 
 
 def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits, reasons: int) -> Sought:
-    """Search positions before the update of an epoch, and add hypotheses to the state that is predicted to the epoch.
+    """Search for positions at an epoch, and add hypotheses to the state predicted to this epoch.
 
-    `reasons` are bits of `kernels.tracking.index` (`LOST_TRACK`, `GAP`, `CONTRADICTED`); ignored without a hypothesis.
+    `reasons` are bits of `kernels.tracking.index` (`LOST_TRACK`, `GAP`, `CONTRADICTED`), ignored without a hypothesis.
     """
     if not state.hypotheses:
         arc = places(chunk, epoch, line, limits)
@@ -194,17 +194,17 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
 
 
 def _start_branches(state: TrackState) -> None:
-    """Reset the time and the distance that are counted since the hypotheses began."""
+    """Reset the time and distance since the start of the hypotheses, and their evidence."""
     state.hypothesis["log_least"], state.hypothesis["log_recent"] = state.hypothesis["log_probability"], 0.0
     state.monitors = replace(state.monitors, branch_s=0.0, branch_m=0.0)
 
 
 def _reset_monitors(state: TrackState, *, lost: bool, weak: bool) -> None:
-    """Reset the monitors that refer to earlier positions, and withhold the level after a loss of track."""
+    """Reset the monitors that refer to earlier positions, and withhold protection levels if weights were low."""
     _start_branches(state)
     hold = state.monitors.level_hold_s
     if lost and state.monitors.weak_code_s >= constants.LOST_CODE_S:
-        # Codes have contradicted the position propagated by motion, so the next position is determined by codes alone.
+        # Codes have contradicted the position propagated by motion, so that codes alone determine the next position.
         hold = max(hold, constants.STEP_HOLD_S)
     if weak:
         hold = max(hold, constants.LEVEL_START_S)
@@ -217,10 +217,10 @@ def _reset_monitors(state: TrackState, *, lost: bool, weak: bool) -> None:
 def _split_wide(
     state: TrackState, arc_m: Floats, wide: Masks, line: Line
 ) -> tuple[list[_Part], list[SplitHypothesis | None]]:
-    """Return narrow hypotheses at positions within wide hypotheses, and splits by hypothesis (None for old hypotheses).
+    """Return narrow hypotheses at those positions `arc_m` [m] that lie within `wide` hypotheses, and `Sought.splits`.
 
-    A narrow hypothesis is the wide hypothesis conditioned on a position with `START_SIGMA_M`. Its probability is
-    proportional to the wide density at this position.
+    A narrow hypothesis is the wide hypothesis conditioned on one position with the standard deviation `START_SIGMA_M`.
+    Its probability is proportional to the density of the wide hypothesis at this position.
     """
     parts: list[_Part] = []
     splits: list[SplitHypothesis | None] = [None] * state.hypotheses
@@ -247,28 +247,28 @@ def _split_wide(
 
 
 def _begin_elsewhere(state: TrackState, arc: Floats, line: Line, limits: TrackingLimits, *, weak: bool) -> _Part:
-    """Return hypotheses at positions away from a lost track; `weak`: weights have been low for a long time."""
+    """Return hypotheses at positions `arc` away from a lost track. `weak` is True if low weights caused the loss."""
     log_probability = state.hypothesis["log_probability"]
     best = int(np.argmax(log_probability))
     elsewhere = 1.0 if weak or state.monitors.contradiction >= constants.CONTRADICTION_TAKEN else _ELSEWHERE
-    # A hypothesis less probable than a new hypothesis has drifted away from the position that agrees with the codes.
+    # A hypothesis less probable than a new hypothesis has drifted away from the position that the codes determine.
     alive = log_probability >= np.log(elsewhere / len(arc))
     going = state.mean[best : best + 1, ix.ARC] if weak else state.mean[alive, ix.ARC]
     there = line.nearest_m(arc[:, None], going)
     arc = arc[(np.abs(there - going) > limits.start_separation_m).all(axis=1)]
-    # If the weights were low, the old position is kept with an inflated variance, so that codes can correct it. If only
-    # the velocity contradicts the position, the hypotheses continue unchanged.
+    # If the weights were low, a hypothesis begins at the old position too, with a large variance that codes can reduce.
+    # If only the velocity contradicts the position, the old hypotheses continue.
     arc = np.concatenate([going, arc]) if weak else arc
     fresh = begin(arc, len(state.satellite), line, limits, known=(state.mean[best], state.covariance[best]))
     return (*fresh, _new_records(np.full(len(arc), np.log(elsewhere / max(len(arc), 1))), arc))
 
 
 def _try_beside(state: TrackState, line: Line, limits: TrackingLimits) -> int:
-    """Add hypotheses a short way ahead of and behind each separate hypothesis; return the number of added hypotheses.
+    """Add hypotheses a short distance ahead of and behind each hypothesis; return the number of added hypotheses.
 
-    Where a line turns back within some tens of metres, the Dopplers agree equally with travel forward on one leg and
-    backward on the other leg, and equations linearised before the bend are not valid beyond it. Every lap gets
-    neighbours, because neighbours of the most probable lap alone would reduce the probability of other laps.
+    Where a line turns back within some tens of metres, the Dopplers agree equally with forward travel on one leg and
+    backward travel on the other leg, and equations linearised before the bend are not valid beyond the bend. Every lap
+    gets neighbours, because neighbours of the most probable lap alone would make other laps less probable.
     """
     parents: list[int] = []
     room = (limits.most_hypotheses - state.hypotheses) // _BESIDE

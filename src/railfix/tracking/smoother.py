@@ -1,9 +1,8 @@
 """Smoothed positions: filter estimates combined with all later measurements (docs/filter-equations.md).
 
 The smoother has the adjoint form of G. J. Bierman, Fixed interval smoothing with discrete measurements, 1973,
-doi:10.1080/00207177308932424. The smoother uses the measurement weights of the filter, and at each epoch the hypothesis
-that led to the last hypothesis. Information of later epochs is not propagated backward beyond the beginning of a
-hypothesis.
+doi:10.1080/00207177308932424. It uses the measurement weights of the filter, and follows the last hypothesis backward
+to its beginning. Information of later epochs is not propagated beyond this beginning.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from railfix.tracking.state import TrackState
 
 
 def _carry_through_measurements(step: Step, h: int, vector: Floats, matrix: Floats) -> tuple[Floats, Floats]:
-    """Propagate hypothesis h's information from later epochs backward through the measurements of an epoch."""
+    """Propagate later information on hypothesis `h` backward through the measurements of an epoch."""
     from railfix.kernels.tracking.backward import before_measurements
 
     made = step.trace
@@ -33,7 +32,7 @@ def _carry_through_measurements(step: Step, h: int, vector: Floats, matrix: Floa
         )
     part = None if step.splits is None else step.splits[h]
     if part is not None:
-        # The ratio of the narrow to the wide density is treated as a measurement of the position.
+        # The density of the narrow hypothesis divided by that of the wide hypothesis acts as a position measurement.
         place = ix.ARC
         wide = part.covariance[place, place]
         back = np.eye(len(vector))
@@ -46,7 +45,7 @@ def _carry_through_measurements(step: Step, h: int, vector: Floats, matrix: Floa
 
 
 def transition(mean: Floats, dt: float, limits: TrackingLimits) -> Floats:
-    """Return the transition matrix (N, N) of all unknowns over the interval `dt` [s], for the state `mean` (N,)."""
+    """Return the transition matrix over the interval `dt` [s], shape (N, N), for the state `mean`, shape (N,)."""
     from railfix.kernels.tracking.backward import transition_matrix
 
     epoch = np.zeros(1, dtype=EPOCH)
@@ -58,7 +57,7 @@ def transition(mean: Floats, dt: float, limits: TrackingLimits) -> Floats:
 class BackwardInformation:
     """Information of all later epochs on the unknowns after an epoch."""
 
-    place_m: float  #: Arc length of the hypothesis that later epochs continue; NaN without such a hypothesis.
+    place_m: float  #: Arc length of the hypothesis that continues in later epochs; NaN without such a hypothesis.
     vector: Floats  #: Information vector of the unknowns, shape (N,).
     matrix: Floats  #: Information matrix of the unknowns, shape (N, N).
     satellite: Strings  #: Satellites whose errors are among the unknowns, shape (N - ix.SATELLITES,).
@@ -128,16 +127,16 @@ def smooth_steps(
 
 
 def _ionosphere_m2(step: Step, h: int, vector: Floats, matrix: Floats, quiet_m: float) -> float:
-    """Return the variance along the line that an epoch's ionosphere adds to that of a quiet ionosphere [m^2]."""
+    """Return the increase of the variance along the line [m^2] if an epoch's ionosphere is not quiet."""
     both = step.covariance[h][[ix.ARC, ix.SLOW_CODE]]
     P = both[:, [ix.ARC, ix.SLOW_CODE]] - both @ matrix @ both.T
     less = (1.0 - max(step.tilt_scale, 1.0) ** -2) / quiet_m**2
-    gain = P[0, 1] * less / (1.0 - less * P[1, 1])  # as `widen_slow_code` of the filter
+    gain = P[0, 1] * less / (1.0 - less * P[1, 1])  # as in `widen_slow_code` of the filter
     return float(gain * P[0, 1] + (gain * (step.mean[h, ix.SLOW_CODE] + both[1] @ vector)) ** 2)
 
 
 def _arrange(later: BackwardInformation, satellite: Strings) -> tuple[Floats, Floats]:
-    """Return the vector and the matrix for given satellites; 0 for satellites that are not in the later state."""
+    """Return information vector and matrix in the order of given satellites; 0 for satellites missing in `later`."""
     _, here, there = np.intersect1d(satellite, later.satellite, return_indices=True)
     to = np.concatenate([np.arange(ix.SATELLITES), ix.SATELLITES + here])
     of = np.concatenate([np.arange(ix.SATELLITES), ix.SATELLITES + there])

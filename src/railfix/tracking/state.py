@@ -1,4 +1,4 @@
-"""State of the filter: hypotheses, which are Gaussian distributions of the same unknowns."""
+"""State of the filter, with hypotheses that are Gaussian distributions of the same unknowns."""
 
 from __future__ import annotations
 
@@ -18,38 +18,38 @@ ANY_SPEED: Final = (-np.inf, np.inf)
 
 @dataclass(frozen=True, kw_only=True)
 class Monitors:
-    """Scalars of the state: adapted parameters, and monitors of contradictions."""
+    """Scalars of the state: adapted parameters, and indicators of contradictory measurements."""
 
     weak_motion_s: float = 0.0  #: Time for which the mean weight of Dopplers and phases has been low [s].
     weak_code_s: float = 0.0  #: Time for which the mean weight of codes has been low [s].
-    #: Logarithm of the estimated Doppler variance divided by the variance of `TrackingLimits`.
+    #: Logarithm of the ratio of the estimated Doppler variance to the variance assumed in `TrackingLimits`.
     log_doppler_scale: float = 0.0
     log_phase_scale: float = 0.0  #: As `log_doppler_scale`, for carrier phases.
     #: Mean position shift implied by the codes of the last epochs, in standard deviations.
     code_shift: float = 0.0
     code_shift_variance: float = 0.0  #: Variance of `code_shift`.
-    #: Logarithm of the factor by which the variance of map lengths exceeds the assumed variance, at least 0.
+    #: Logarithm of the ratio of the variance of map lengths to the assumed variance, at least 0.
     map_log_variance: float = 0.0
-    #: Cumulative sum of contradictions in the velocity along and across the line (`kernels.tracking.monitors`).
+    #: Cumulative sum of contradictions between velocity and line (`kernels.tracking.monitors`).
     contradiction: float = 0.0
     #: One minus the recent mean weight of Dopplers and phases; 0 where a sensor measures the speed.
     motion_misfit: float = 0.0
-    step_s: float = 0.0  #: Time for which all codes have implied a different position [s].
-    level_hold_s: float = 0.0  #: Remaining time for which all levels are withheld [s].
-    #: Remaining time for which the level along the line is withheld, because other positions were more probable than
-    #: the risk [s].
+    step_s: float = 0.0  #: Time for which the codes together have implied a different position [s].
+    level_hold_s: float = 0.0  #: Remaining time for which all protection levels are withheld [s].
+    #: Remaining time for which the protection level along the line is withheld [s], because other positions were more
+    #: probable than the risk.
     ambiguity_hold_s: float = 0.0
-    branch_s: float = 0.0  #: Time since the hypotheses began [s].
-    branch_m: float = 0.0  #: Distance since the hypotheses began [m].
+    branch_s: float = 0.0  #: Time since the start of the hypotheses [s].
+    branch_m: float = 0.0  #: Distance since the start of the hypotheses [m].
     distance_since_code_m: float = 0.0  #: Distance since the last used codes [m].
     direction: float = 0.0  #: Sign of the last speed with a known direction.
-    #: Least and largest speed that the measured speeds permit (`railfix.kernels.tracking.model.narrow_speed_range`);
-    #: unbounded with several hypotheses.
+    #: Bounds of the speed by earlier measured speeds (`railfix.kernels.tracking.model.narrow_speed_range`). With
+    #: several hypotheses, the speed is unbounded.
     least_speed_mps: float = ANY_SPEED[0]
     most_speed_mps: float = ANY_SPEED[1]
     #: Time from `TrackState.origin` to the last epoch with used measurements; NaN before the first such epoch.
     measured_s: float = np.nan
-    #: Time from `TrackState.origin` to the last epoch with used codes; -inf if the next codes are used in any case.
+    #: Time from `TrackState.origin` to the last epoch with used codes; -inf if the next codes must be used.
     coded_s: float = -np.inf
 
 
@@ -62,17 +62,18 @@ class Bank:
     without: tuple[str, ...]
     mean: Floats  #: Means of the unknowns, shape (B, N).
     covariance: Floats  #: Covariances of the unknowns, shape (B, N, N).
-    contradicted_s: Floats  #: Time for which a sub-filter has been inconsistent with its own measurements, shape (B,).
+    #: Time for which each sub-filter has been inconsistent with its own measurements, shape (B,).
+    contradicted_s: Floats
 
 
-#: Record type of the state's scalars: the fields of `Monitors`, and the number of hypotheses.
+#: Record type of the state's scalars: the fields of `Monitors` and the number of hypotheses.
 MONITORS: Final = record_of(dict.fromkeys(Monitors.__dataclass_fields__, float) | {"hypotheses": np.intp})
-#: Record type of a hypothesis, without mean and covariance.
+#: Record type of a hypothesis, apart from mean and covariance.
 HYPOTHESIS: Final = record_of({
     "log_probability": float,  # logarithm of the probability
     "log_code": float,  # part of `log_probability` due to codes (`railfix.kernels.tracking.hypotheses`)
-    "log_least": float,  # recent minimum of `log_probability`, which rises with time (`constants.LEAST_RISE`)
-    # Recent code evidence against laps within the map error (`constants.RECENT_S`); not a probability.
+    "log_least": float,  # minimum of `log_probability`, which slowly rises with time (`constants.LEAST_RISE`)
+    # Recent code evidence between laps within the map error (`constants.RECENT_S`); not a probability.
     "log_recent": float,
     "origin_m": float,  # arc length at the start of the hypothesis [m]
 })  # fmt: skip
@@ -80,7 +81,7 @@ HYPOTHESIS: Final = record_of({
 
 @dataclass(kw_only=True)
 class TrackState:
-    """State after an epoch: H hypotheses of N unknowns. The arrays are replaced, never modified in place."""
+    """State after an epoch, with H hypotheses of N unknowns. Arrays are replaced, never modified in place."""
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Time of the last epoch.
     origin: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Time of the first epoch.
@@ -88,12 +89,12 @@ class TrackState:
     mean: Floats = field(default_factory=lambda: np.empty((0, ix.SATELLITES)))
     #: Covariances of the unknowns, shape (H, N, N).
     covariance: Floats = field(default_factory=lambda: np.empty((0, ix.SATELLITES, ix.SATELLITES)))
-    hypothesis: Records = field(default_factory=lambda: np.empty(0, dtype=HYPOTHESIS))  #: `HYPOTHESIS`, shape (H,).
+    hypothesis: Records = field(default_factory=lambda: np.empty(0, dtype=HYPOTHESIS))  #: Records, shape (H,).
     #: Satellites whose errors are in the state, shape (N - ix.SATELLITES,).
     satellite: Strings = field(default_factory=lambda: np.empty(0, dtype="<U3"))
     #: Time at which each satellite was last observed, shape (N - ix.SATELLITES,).
     seen: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))
-    #: Mean normalised innovation of each satellite's codes (`kernels.tracking.adaptation`), shape (N - ix.SATELLITES,).
+    #: Mean innovation of each satellite's codes, shape (N - ix.SATELLITES,) (`kernels.tracking.adaptation`).
     code_bias: Floats = field(default_factory=lambda: np.empty(0))
     #: True for receiver clocks that have been observed, shape (len(ix.CLOCKS),).
     offset_known: Masks = field(default_factory=lambda: np.zeros(len(ix.CLOCKS), dtype=np.bool_))
@@ -107,7 +108,7 @@ class TrackState:
         return len(self.hypothesis)
 
     def reset(self) -> None:
-        """Reset hypotheses, sub-filters, clocks and adapted parameters; hold times of levels are kept."""
+        """Reset hypotheses, sub-filters, clocks and adapted parameters; keep the hold times of protection levels."""
         width = ix.SATELLITES + len(self.satellite)
         self.mean, self.covariance = np.empty((0, width)), np.empty((0, width, width))
         self.hypothesis = self.hypothesis[:0]
