@@ -53,7 +53,7 @@ _END_SIGMAS: Final = 4.0
 _END_M: Final = 30.0
 #: Half-width of the gate of two-way ranges around the predicted range, in standard deviations.
 _GATE_SIGMAS: Final = 3.0
-#: Minimum half-width of the gate for long ranges [m]. Echoes arrive late, and are separable from 0.3 m (P2, table 3).
+#: Minimum half-width of the gate towards long ranges [m]. Echoes over 0.3 m longer are separable (P2, table 3).
 _LATE_M: Final = 0.6
 #: Vertical error of the ionospheric model for which the filter's displacements (`slow_code_m`, `TILT_M`) are valid [m].
 _QUIET_IONOSPHERE_M: Final = 1.0
@@ -274,7 +274,7 @@ def _gate(
 
 
 def _gated_ranges(ranges: RangeEpochs, time: Datetimes, line: Line, state: FilterState, config: Config) -> RangeEpochs:
-    """Return the two-way ranges; NaN where inconsistent with the filter's position, or without a position (P2 3.3).
+    """Return the two-way ranges; NaN if there is no filter position, or a range is inconsistent with it (P2 3.3).
 
     The gate rejects echoes and ranges to wrongly surveyed units. The position is predicted from the start of the block
     with constant speed; a possible acceleration widens the gate with the square of the elapsed time.

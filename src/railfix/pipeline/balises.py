@@ -63,8 +63,8 @@ def balise_epochs(
     """Assign each reading to the next epoch; return the measured balise positions, and the state for the next chunk.
 
     Unlisted balises and readings repeated within `AGAIN_S` are left out. Successive balises alternate between two
-    columns. Each column is excluded by one sub-filter, which a wrong balise in that column therefore does not affect.
-    `edges` has the epoch before the chunk and the epochs of the chunk, shape (T + 1,).
+    columns. Each column is omitted by one sub-filter, so that a wrong balise does not affect that sub-filter. `edges`
+    has the epoch before the chunk and the epochs of the chunk, shape (T + 1,).
     """
     found = BaliseEpochs.none(len(edges) - 1)
     index, arc = listed.find_index(readings.balise), arcs_of_balises(listed, trajectory, limits)

@@ -55,7 +55,7 @@ class BaseState:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Note that no epoch with a known station position has been received so far; empty otherwise."""
+        """One note if no epoch with a known station position has been received so far; otherwise empty."""
         return () if self.errors is not None else (_NO_EPOCH,)
 
     def beside(self, received: Received) -> Received:
@@ -68,9 +68,9 @@ class BaseStation:
     """Base station at a known ECEF position, shape (3,) [m], in the reference frame of the satellite orbits.
 
     The station's pseudoranges are corrected like those of the train, and smoothed by carrier phase where available.
-    Smoothing reduces the station's noise, but not its multipath. With "stream" the position is taken from the headers
-    of the observations. The state restarts if this position changes by more than a centimetre, for example at a change
-    of virtual station.
+    Smoothing reduces the station's noise, but not its multipath. If the position is "stream", it is read from the
+    headers of the observations. The state is reset if this position changes by more than a centimetre, for example if
+    the virtual station changes.
     """
 
     def __init__(self, config: Config, ecef_m: Floats | Literal["stream"]) -> None:
@@ -87,7 +87,7 @@ class BaseStation:
     def add_observations(
         self, obs: Observations | None, received: Received, state: BaseState | None, began: np.datetime64
     ) -> BaseState:
-        """Add observations of the station to the state; drop errors too old for epochs after `began`."""
+        """Add observations of the station to the state; drop range errors that are too old for epochs after `began`."""
         state = state or BaseState()
         if obs is not None and len(obs):
             place = obs.header.approximate_ecef_m if self._ecef_m is None else self._ecef_m
@@ -104,7 +104,7 @@ class BaseStation:
         return replace(state, errors=state.errors.drop_before(began - kept))
 
     def _rows(self, ecef_m: Floats) -> AntennaRows:
-        """Return the rows of an antenna on a short trajectory through the station."""
+        """Return the station as an antenna on a short trajectory."""
         if self._antenna is None or np.any(self._antenna[0] != ecef_m):
             latitude, longitude, height = (float(x) for x in geodetic_from_ecef(ecef_m))
             ends = ecef_from_geodetic(latitude + np.array([-1.0, 1.0]) * _HALF_LINE_DEG, longitude, height)

@@ -1,4 +1,4 @@
-"""Apply carrier-phase smoothing or float ambiguities."""
+"""Smooth codes by the carrier phase, or estimate positions from code and phase."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ LOWEST_WEIGHTED_DEG = 5.0
 class CarrierState:
     """Carrier-phase state of one antenna; the fields are None before the first epoch.
 
-    `base_arc` is the number of the last arc of a base station's phase, by satellite and signal.
+    `base_arc` has the number of the base station's last phase arc, by satellite and signal.
     """
 
     slips: CycleSlipState | None = None
@@ -152,7 +152,7 @@ def code_and_phase(
 
 
 def _base_slips(corrected: CorrectedRanges, state: CarrierState) -> tuple[Masks, dict[tuple[str, str], int]]:
-    """Return a mask (T, K) of the starts of arcs of the base station's phases, and the last arc of each channel."""
+    """Return a mask (T, K) of epochs at which a phase arc of the base station starts, and the last arcs."""
     assert corrected.base is not None
     keys = list(zip(corrected.satellite.tolist(), corrected.signal.tolist(), strict=True))
     before = np.array([state.base_arc.get(key, -1) for key in keys], dtype=np.int64)
@@ -176,7 +176,7 @@ def _lasting(
 
 
 def _integer_channels(corrected: CorrectedRanges) -> IntegerChannels:
-    """Return wavelengths, and groups of channels with a common clock and signal; -1 for GLONASS (never fixed)."""
+    """Return the channels' wavelengths and ambiguity groups (common clock and signal); -1 if never fixed (GLONASS)."""
     names = zip(corrected.satellite.tolist(), corrected.signal.tolist(), strict=True)
     labels = ["" if name[0] == "R" else CLOCK_GROUP[name[0]] + signal for name, signal in names]
     _, group = np.unique(labels, return_inverse=True)

@@ -1,4 +1,4 @@
-"""Data of a chunk of epochs that the stages of the pipeline pass on."""
+"""Data of a chunk of epochs, passed from stage to stage of the pipeline."""
 
 from __future__ import annotations
 

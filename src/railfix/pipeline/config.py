@@ -12,7 +12,7 @@ Each package defines its own limits; this module collects them under their names
     [noise]
     model = "elevation"
 
-A preset names a set of settings; single settings override it.
+A preset is a named set of settings; individual settings override it.
 """
 
 from __future__ import annotations
@@ -115,12 +115,12 @@ class Config(ScreenSettings):
 
     #: Base preset; other settings override it. "p1" is table 6 of P1: elevation mask 20 deg, C/N0 floor 30 dB-Hz and 10
     #: dB-Hz below the curve, Doppler 1.5 m (no hold), antenna pair 5 m with one clock for both receivers (P1 2.3(3)),
-    #: RAIM with two satellites and 100 m^2, antenna spacing 5 m, failed checks dropped. Settings that P1 does not
-    #: specify (weights, noise, inter-system biases, ambiguous sections) are as in "default".
+    #: RAIM with two satellites and 100 m^2, antenna spacing 5 m, positions with failed checks dropped. Settings that P1
+    #: does not specify (weights, noise, inter-system biases, ambiguous sections) are as in "default".
     preset: Literal["default", "strict", "p1"] = "default"
     #: Constellations used. GLONASS is left out by default, because code biases between its channels reach metres.
     systems: tuple[Literal["G", "J", "E", "C", "R"], ...] = ("G", "J", "E", "C")
-    #: Satellites ("G07") and constellations ("C") left out.
+    #: Satellites ("G07") and constellations ("C") that are not used.
     exclude: tuple[Annotated[str, Field(pattern=r"^[GJECR]([0-9]{2})?$")], ...] = ()
     #: Signals of each constellation in order of preference; the first observed signal is used.
     signals: dict[str, tuple[str, ...]] = Field(default_factory=lambda: dict(DEFAULT_SIGNALS))
@@ -129,10 +129,10 @@ class Config(ScreenSettings):
     two_frequencies: TwoFrequencyLimits = TwoFrequencyLimits()  #: Limits of the combination of two codes.
     #: Active screens; health and validity of the satellites are always checked.
     screens: tuple[str, ...] = SCREEN_NAMES
-    #: File with the mean C/N0 by elevation, written by ``railfix cn0-curve``. Without a file, only the floor is used.
+    #: File with the mean C/N0 by elevation, written by ``railfix cn0-curve``. Without a file, only the floor applies.
     cn0_curve: Path | None = None
-    #: Treatment of the coordinates of positions with a failed check (`reasons.CHECK_FAILED`): they are kept, with the
-    #: status of the check, or dropped as in P1.
+    #: Whether the coordinates of positions with a failed check (`reasons.CHECK_FAILED`) are kept, with the status of
+    #: the check, or dropped as in P1.
     failed_checks: Literal["keep", "drop"] = "keep"
     #: Availability/accuracy threshold: a position whose single-epoch sigma (`Solution.epoch_sigma_m`) exceeds this
     #: limit is `uncertain`, a failed check. With ``carrier = "float"`` the sigma of the published position is compared
@@ -144,14 +144,14 @@ class Config(ScreenSettings):
     #: Probability that noise alone makes a position count as off the map. The noise is estimated from the residuals of
     #: the 3-D fit.
     off_map_risk: float = Field(default=1e-6, gt=0, lt=1)
-    #: Probability that the train is on another track, above which positions on a network are neither `ok` nor
-    #: `tracking`, and have no level. `railfix which-track` uses the same limit.
+    #: Largest probability that the train is on another track. Above it, positions on a network are neither `ok` nor
+    #: `tracking`, and have no protection level. `railfix which-track` uses the same limit.
     track_risk: float = Field(default=1e-3, gt=0, lt=1)
     ionosphere: Literal["klobuchar", "off"] = "klobuchar"  #: Model of the ionospheric delay.
     troposphere: Literal["saastamoinen", "off"] = "saastamoinen"  #: Model of the tropospheric delay.
     #: Largest age of a navigation record; older records are not used, even if they are valid.
     max_ephemeris_age_s: float | None = Field(default=None, gt=0)
-    #: Standard deviation of the map, in place of the value in the track file (P1: 0.30 m in plan, 0.60 m in height).
+    #: Standard deviations of the map, in place of those in the track file (P1: 0.30 m in plan, 0.60 m in height).
     map_plan_sigma_m: float | None = Field(default=None, gt=0)
     map_height_sigma_m: float | None = Field(default=None, gt=0)
     noise_scale: NoiseScaleLimits = NoiseScaleLimits()  #: Estimation of the receiver's noise from the residuals.
@@ -162,8 +162,8 @@ class Config(ScreenSettings):
     map_offset: MapOffsetLimits = MapOffsetLimits()  #: Test of the map against the 3-D positions of the last minutes.
     interference: InterferenceLimits = InterferenceLimits()  #: Signs of jamming and spoofing.
     noise: CodeNoise = CodeNoise()  #: Range sigmas, from which the weights follow.
-    #: Logs of SBAS messages, or "stream" for the receivers' messages. SBAS corrections replace the models, and
-    #: satellites without a valid correction are rejected. Empty for no SBAS.
+    #: Files of SBAS messages, or "stream" for messages that the receivers pass on; empty if SBAS is not used. SBAS
+    #: corrections replace the models, and satellites without a valid correction are rejected.
     sbas: tuple[Path, ...] | Literal["stream"] = ()
     #: Messages to use: L1 messages correct GPS L1 C/A; L5 messages (dual-frequency) correct the ionosphere-free codes
     #: of GPS L1 C/A and L5, and of Galileo E1 and E5a. With L5, satellites without both codes are rejected.
@@ -172,32 +172,32 @@ class Config(ScreenSettings):
     sbas_prn: int | Literal["best"] = "best"
     #: SBAS time-outs, use of message type 0, and treatment of missing degradation data.
     sbas_limits: SbasLimits = SbasLimits()
-    base: BaseLimits = BaseLimits()  #: Limits of the differences with a base station.
+    base: BaseLimits = BaseLimits()  #: Limits of the corrections by a base station.
     #: File with overbounds of the range errors by direction and C/N0, written by ``railfix error-model``. For the
     #: protection level, each range sigma is raised at least to the sigma of the overbound. Weights, screens and RAIM
-    #: use `noise` alone. Without the file, the level uses `noise` times the noise scale estimated so far, which does
-    #: not bound the tails.
+    #: use `noise` alone. Without the file, the protection level uses `noise` times the noise scale estimated so far,
+    #: which does not bound the tails.
     error_model: Path | None = None
-    #: Satellite and atmospheric errors that are added to a model of local errors without SBAS.
+    #: Satellite and atmospheric errors. Without SBAS, they are added to an error model of local errors.
     nominal: NominalErrors = NominalErrors()
-    protection: Literal["on", "off"] = "on"  #: Whether the protection level along the line and its parts are computed.
-    #: Integrity risk per hour, its allocation, and the fault probabilities that the level assumes.
+    protection: Literal["on", "off"] = "on"  #: Computation of the along-track protection level.
+    #: Integrity risk per hour, its allocation, and the assumed fault probabilities.
     risk: RiskBudget = RiskBudget()
     #: Integrity support message (TOML, ``docs/protection-level.md``) for additional ARAIM levels, along the track and
-    #: in 3-D. Not with SBAS.
+    #: in 3-D. It cannot be combined with SBAS.
     integrity_support: Path | None = None
     araim: AraimBudget = AraimBudget()  #: Risk allocation of the ARAIM levels.
     #: Largest protection level of an available position. P4 uses a car length, 20 m.
     alarm_limit_m: float = Field(default=20.0, gt=0, le=1e5)
-    #: Chainage intervals in which local faults cannot be bounded, and the level is infinite. ``railfix error-model``
-    #: prints the intervals that it finds.
+    #: Chainage intervals in which local faults cannot be bounded, so that the protection level is infinite. ``railfix
+    #: error-model`` prints the intervals that it finds.
     no_level_m: tuple[tuple[float, float], ...] = ()
-    #: Whether the protection level of P4 is computed as well: the largest slope times the largest undetected bias.
+    #: Computation of the RAIM protection level of P4: the largest slope times the largest undetected bias.
     raim_protection: Literal["on", "off"] = "off"
-    #: Use of the carrier phase: none; smoothing of codes; or code and phase together from this and earlier epochs, with
-    #: float ambiguities, or with integer ambiguities, which require a base station ("fixed"). On recordings, smoothing
-    #: helps most on a phone, and float ambiguities help most under open sky. In towns, where arcs last seconds, neither
-    #: removes large errors.
+    #: Use of the carrier phase. "smoothed" smooths the codes. "float" and "fixed" estimate positions from the codes and
+    #: phases of this and earlier epochs, with float or integer ambiguities ("fixed" requires a base station). On
+    #: recordings, smoothing helps most on a phone, and float ambiguities help most under open sky. In towns, where arcs
+    #: last seconds, neither removes large errors.
     carrier: Literal["off", "smoothed", "float", "fixed"] = "off"
     #: Standard deviation of a carrier phase at the zenith, multipath included.
     phase_sigma_m: float = Field(default=0.01, gt=0)
@@ -208,8 +208,8 @@ class Config(ScreenSettings):
     #: Filter along the track, which combines codes, Dopplers, carrier-phase changes and sensors of this and earlier
     #: epochs. `railfix run` and `railfix demo` switch it on.
     filter: Literal["track", "off"] = "track"
-    #: Measurements of the filter: `code`, `phase` and `doppler` of the satellites, and `wheel`, `radar`, `force`,
-    #: `feature` (of the line, by inertial unit and wheel), `balise`, `range` of the on-board sensors.
+    #: Measurements of the filter. Satellites provide `code`, `phase` and `doppler`; on-board sensors provide the
+    #: others. `feature` is the position of a line feature that the inertial unit and the tachometer detect.
     filter_sources: tuple[FilterSource, ...] = FILTER_SOURCES
     tracking: TrackingLimits = TrackingLimits()  #: Process and measurement noise of the filter.
     sensors: SensorLimits = SensorLimits()  #: Noise of the on-board sensors, and the tachometer's wheel.
@@ -284,7 +284,7 @@ class Config(ScreenSettings):
 
     @cached_property
     def local_risk(self) -> RiskBudget:
-        """Risk budget of local faults only, because SBAS covers satellite faults."""
+        """Risk budget with SBAS: local faults only, because SBAS covers satellite faults."""
         none = dict.fromkeys(self.risk.satellite_prior, 0.0)
         return self.risk.replaced(satellite_prior=none, constellation_prior={})
 

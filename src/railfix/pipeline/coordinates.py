@@ -12,7 +12,7 @@ from railfix.track.trajectory import Trajectory
 
 
 class LineCoordinates:
-    """Base of dataclasses with arc lengths `arc_m` of T epochs on a trajectory; NaN without a position."""
+    """Base of dataclasses with arc lengths `arc_m` of T epochs on a trajectory; NaN at epochs without a position."""
 
     if TYPE_CHECKING:  # fields of the dataclass
 

@@ -27,7 +27,7 @@ from railfix.positioning.range_arrays import Ranges
 from railfix.positioning.receiver_noise import NoiseState, noise_scale
 from railfix.ranges.corrected import CorrectedRanges
 
-#: Largest ratio of an epoch's residual variance to the assumed variance that noise is assumed to cause: (100 sigmas)^2.
+#: Epochs count towards the noise scale up to this ratio of residual to assumed variance: (100 sigmas)^2.
 _LARGEST_VARIANCE: Final = 1e4
 
 
@@ -52,12 +52,12 @@ def check_ranges(
 ) -> tuple[CorrectedRanges, Ranges, CheckedPositions, list[AntennaState]]:
     """Exclude persistent faults and then single faults; return the ranges, the positions with noise scales, and states.
 
-    The robust scale, which RAIM uses, is estimated from mutually consistent ranges. The reported scale is estimated
-    from the ranges that remain after RAIM.
+    The robust noise scale, which RAIM uses, is estimated from mutually consistent ranges. The reported noise scale is
+    estimated from the ranges that remain after RAIM.
     """
     time, near = corrected.time, corrected.near_ecef_m
     on, noises = "raim" in config.screens, [state.noise for state in states]
-    learning, least = config.noise_scale, 1.0 if config.sbas else 0.0  # SBAS sigmas are overbounds
+    learning, least = config.noise_scale, 1.0 if config.sbas else 0.0  # SBAS sigmas are overbounds: no smaller scale
     windows = Windows.of(
         time, antennas.parts, [(noise.time, noise.age) for noise in noises],
         window_s=learning.window_s, least_epochs=learning.least_epochs,
@@ -121,8 +121,8 @@ def contradict_map(ranges: Ranges, antennas: AntennaRows, fix: LineFix, arc: Flo
     """Return the epochs whose ranges contradict the map, or indicate a position beyond an end of the map, shape (T,).
 
     Ranges contradict the map if the position on the line fits significantly worse than the 3-D position (chi-square
-    test with `Config.off_map_risk`). The difference of the weighted squares is divided by the residual variance of the
-    3-D fit, at least 1.
+    test with `Config.off_map_risk`). The difference of the weighted sums of squares is divided by the residual variance
+    of the 3-D fit, or by 1 if the variance is smaller.
     """
     point, constrained = fix.point, fix.constrained
     wsse = constrained.wsse

@@ -129,7 +129,7 @@ class AlongTrack(LineCoordinates, NotebookTable):
         return f"{int(is_bounded(self.tracked.status).sum()):,} of {plural(self, 'epoch')} tracking or coasting"
 
     def summary(self) -> dict[str, str]:
-        """Return the medians of sigma and level in metres, as strings."""
+        """Return the medians of sigma and protection level in metres, as strings."""
         tracked = self.tracked
         return {"median sigma [m]": median_text(tracked.sigma_m), "median level [m]": median_text(tracked.level_m)}
 

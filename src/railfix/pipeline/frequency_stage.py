@@ -22,9 +22,9 @@ from railfix.screens import Screened, Verdict
 NAME: Final = "two_frequencies"
 #: Arc over which the ionospheric model error is correlated [rad]: 1000 km.
 _IONOSPHERE_ARC: Final = 0.157
-#: Deviation of a delay from a plane over the sky, as a fraction of the delay. Galileo delays deviate by 0.06 of 1.5 m
-#: at a station in a solar minimum, 0.02 of 3.9 m on a drive in Japan, 0.05 of 6.4 m on a roof in Japan in 2024 (Walter
-#: et al., Navigation 48, 2001, use 0.35 m).
+#: Deviation of a delay from a plane over the sky, as a fraction of the delay. For Galileo, it was 0.06 at a station in
+#: a solar minimum (mean delay 1.5 m), 0.02 on a drive in Japan (3.9 m), and 0.05 on a roof in Japan in 2024 (6.4 m).
+#: Walter et al. (Navigation 48, 2001) use 0.35 m.
 _IONOSPHERE_REST: Final = 0.05
 
 
@@ -35,7 +35,7 @@ def combine_frequencies(
     ionosphere_sigma_m: float,
     states: Sequence[TwoFrequencyState],
 ) -> tuple[CorrectedRanges, Combined, Verdict, list[TwoFrequencyState]]:
-    """Combine codes; return ranges, the combination, a verdict that lowers inconsistent codes' weights, and states."""
+    """Return combined ranges, the combination, the verdict on inconsistent codes, and the new states."""
     usable, second = corrected.reason == 0, corrected.second
     assert second is not None
     code = np.where(usable, corrected.corrected_code_m, np.nan)
@@ -54,7 +54,7 @@ def combine_frequencies(
     found, after = antennas.each_with_state(own_codes, states)
     local_m, nominal_m = corrected.bound_sigma_m, np.zeros(usable.shape)
     if config.dual_frequency_sbas:
-        gps = np.char.startswith(corrected.satellite, "G")  # corrections refer to clocks without group delays
+        gps = np.char.startswith(corrected.satellite, "G")  # SBAS clock corrections exclude group delays
         delays = (np.where(gps, each, 0.0) for each in (corrected.satellites.group_delay_m, second.group_delay_m))
         found = ionosphere_free(code, noise, second, tuple(delays), found)
         nominal_m = np.where(local_m > 0.0, corrected.nominal_m, 0.0)
@@ -68,7 +68,7 @@ def combine_frequencies(
         bound_sigma_m=np.hypot(local_m * magnified, nominal_m),
         bias_m=corrected.bias_m * magnified,
     )
-    screened = Screened(metric=found.difference_m, reject=found.suspected)  # the limit differs between satellites
+    screened = Screened(metric=found.difference_m, reject=found.suspected)  # no limit: it differs between satellites
     verdict = Verdict(name=NAME, reason=Reason.USED, screened=screened, error_m=found.difference_m)
     return corrected, found, verdict, after
 

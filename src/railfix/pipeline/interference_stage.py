@@ -48,7 +48,7 @@ _MOST_WRONG: Final = 2
 #: Largest number of satellites of one clock with individual gross errors.
 _MOST_GROSS: Final = 4
 _NOT_ITS_SIGNAL: Final = int(Reason.OTHER_SIGNAL_TAKEN)
-#: Statuses of positions that suspected spoofing outranks.
+#: Statuses of positions that suspected spoofing replaces.
 _UNDER_SPOOFING: Final = np.isin(np.arange(len(Status)), [
     Status.OK, Status.AMBIGUOUS, Status.OFF_MAP, Status.INCONSISTENT, Status.ANTENNAS_DISAGREE, Status.UNCERTAIN,
     Status.MAP_OFFSET, Status.MAP_END,
@@ -135,7 +135,7 @@ def _motion_inputs(
 
 
 def _named_as_wrong(reason: Bits, groups: Sequence[slice]) -> Masks:
-    """Return a mask (T, K) of satellites with individual errors, at epochs with too few of them for a spoofer."""
+    """Return a mask (T, K) of satellites with individual errors, at epochs with fewer of them than spoofing affects."""
     wrong, gross = (reason & _WRONG_ALONE) != 0, (reason & int(Reason.GROSS_ERROR)) != 0
     named = wrong & (wrong.sum(axis=1, keepdims=True) <= _MOST_WRONG)
     for group in groups:
@@ -213,8 +213,8 @@ class _Due(NamedTuple):
 
     rows: Indices  #: Indices of these epochs among the rows of all antennas, shape (n,).
     group: Indices  #: Number of checked epochs up to each epoch of the antenna, shape (T,).
-    #: Receiver alarms, and breaks, in the interval that ends at each checked epoch, and after the last checked epoch;
-    #: shape (n + 1,).
+    #: Receiver alarms (and breaks, in `broken`) in the intervals up to each checked epoch and after the last; shape (n
+    #: + 1,).
     alarm: Bytes
     broken: Masks
     last: int  #: GPS second of the last epoch of the chunk.

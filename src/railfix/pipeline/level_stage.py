@@ -40,7 +40,7 @@ from railfix.ranges.corrected import CorrectedRanges
 KINDS: Final[tuple[str, str]] = ("sbas", "separation")
 
 
-#: Whether a status raises an alarm, by status number.
+#: Whether each status raises an alarm; the index is the status number.
 _ALARMING: Final = np.array(
     [status in (*CHECK_FAILED, Status.OFF_MAP, Status.MAP_OFFSET) for status in range(max(Status) + 1)]
 )
@@ -121,7 +121,7 @@ def level_stage(
     offset: MapOffset,
     config: Config,
 ) -> tuple[ProtectionResult | None, Masks]:
-    """Return protection levels (None if not computed), and a mask (T,) of possible positions beyond the level."""
+    """Return protection levels (None if off), and a mask (T,) of epochs with a possible position beyond the level."""
     fix, model, raim, scale, *_ = checked
     if config.protection != "on" or config.carrier in ("float", "fixed"):
         return None, np.zeros(len(ranges), dtype=bool)
@@ -156,8 +156,8 @@ def protection_levels(
     """Return the protection levels of a chunk, from the linear model of the positions on the line.
 
     The part of the measured map offset that exceeds one sigma is a bias in the level; the hypothesis of a wrong map
-    covers an undetected offset. Small residuals do not reduce a level: `level_scale` limits the receiver's noise scale,
-    shape (T,), and with an error model no range sigma is below the overbound. `sides` is the result of `late_sides`.
+    covers an undetected offset. Small residuals do not reduce a level: `level_scale` limits the noise scale, and range
+    sigmas are at least those of the error model. `scale` has shape (T,). `sides` is the result of `late_sides`.
     """
     covariance = np.where(raim.faulty[:, None, None], np.nan, model.covariance_m2)
     level = protection_level(
@@ -283,7 +283,7 @@ def compute_araim(
 
 
 def _sight(corrected: CorrectedRanges, place: Floats) -> tuple[Floats, Floats, Masks]:
-    """Return unit vectors (T, M, 3) and clock columns (M, G) of the M channels used at any epoch, and a mask (K,)."""
+    """Return unit vectors (T, M, 3) and clock columns (M, G) of M channels used at any epoch, and their mask (K,)."""
     channels = (corrected.reason == 0).any(axis=0)
     to_satellite = corrected.satellites.position_ecef_m[:, channels] - place[:, None, :]
     distance = np.linalg.norm(to_satellite, axis=2, keepdims=True)
@@ -302,7 +302,7 @@ def _rotate_geometry(geometry: AraimGeometry, axes: Floats) -> AraimGeometry:
 def with_map(geometry: AraimGeometry, plan_m: float, height_m: float, prior: float) -> AraimGeometry:
     """Return the geometry on a line (axes along, across and up), with the map as two additional observations.
 
-    `plan_m` and `height_m` are standard deviations of the map [m]; `prior` is the probability that both are wrong.
+    `plan_m` and `height_m` are standard deviations of the map [m]; `prior` is the probability of a wrong map.
     """
     epochs, ranges, unknowns = geometry.design.shape
     rows = np.zeros((epochs, 2, unknowns))

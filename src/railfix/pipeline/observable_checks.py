@@ -1,8 +1,8 @@
 """Check of signs and units of Dopplers and carrier phases against satellite range rates.
 
-A satellite's motion changes its range by up to 800 m/s, much more than a train or a receiver clock does. The ratio of a
-constellation's Dopplers, or phase changes, to the computed range rates is 1. It is -1 if the sign is wrong, and the
-wavelength if the log has metres in place of cycles.
+A satellite's motion changes its range by up to 800 m/s, much more than a train or a receiver clock does. The ratio (the
+factor) of a constellation's Dopplers, or phase changes, to the computed range rates should be 1. It is -1 if the sign
+is wrong, and the wavelength if the log has metres in place of cycles.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from railfix.ranges.corrected import CorrectedRanges
 _LEAST_RATE_MPS: Final = 100.0
 #: Minimum number of satellites for a factor; at least one more must be observed, for the median rate.
 _LEAST_SATELLITES: Final = 3
-#: With at least this number of satellites, one may deviate. Among four, a satellite with a cycle slip changes the
-#: factors of the others.
+#: With at least this number of satellites, one satellite's factor may deviate. Among four, a satellite with a cycle
+#: slip changes the factors of the others.
 _MANY: Final = 6
 #: Largest deviation of a satellite's factor from the median factor.
 _SPREAD: Final = 0.3

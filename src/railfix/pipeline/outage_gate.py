@@ -14,7 +14,7 @@ from railfix.tracking import Line
 
 #: Time without codes after which the filter's position counts as dead-reckoned [s].
 _OUTAGE_S: Final = 2.0
-#: Number of positions that must agree before codes are used again.
+#: Number of consecutive positions that must agree with dead reckoning before codes are used again.
 _AGREEING: Final = 3
 #: Standard deviation of a sensor distance since the start of a block, as a fraction of the distance.
 _DISTANCE_SHARE: Final = 0.01

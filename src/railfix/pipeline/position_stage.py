@@ -1,7 +1,7 @@
-"""Antenna positions: conventional and on the line, with fault exclusion, sigma, level and status.
+"""Compute antenna positions, conventional and on the line, with sigma, protection level and status.
 
-The stages in their order (P1 figure 1): 3-D position, inter-system biases, section search, constrained fix, persistent
-biases and single faults, noise scale, test of the map, protection level, carrier phase, status.
+The stages run in this order (P1 figure 1): 3-D position, inter-system biases, section search, constrained fix,
+persistent biases and single faults, noise scale, test of the map, protection level, carrier phase, status.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def position_stage(
     corrected, ranges, checked, states = check_ranges(corrected, ranges, antennas, fix, config, states)
     fix, scale = checked.fix, checked.scale
     constrained, on_map = fix.constrained, np.isfinite(fix.constrained.arc_m) & ~checked.off_map
-    # ranges that agree with no 3-D position agree with no position on a map
+    # ranges that fit no 3-D position do not fit a position on the map either
     unresolved = corrected.unsure | _contradict(fix.point, ranges.space_redundancy, scale)
     off_map = checked.off_map & ~unresolved
 
@@ -122,7 +122,7 @@ def position_stage(
 
 
 def _with_protection_level(checked: CheckedPositions, config: Config) -> RaimResult:
-    """Return the result of RAIM, with RAIM's protection level if it is on; NaN where an unidentified fault remains."""
+    """Return the RAIM result, with the protection level of P4 if `Config.raim_protection` is "on"."""
     raim = checked.raim
     if "raim" not in config.screens or config.raim_protection != "on":
         return raim
@@ -131,7 +131,7 @@ def _with_protection_level(checked: CheckedPositions, config: Config) -> RaimRes
 
 
 def _alone_on_clock(reason: Bits, groups: Sequence[slice], ties: InterSystemBiases) -> Masks:
-    """Return the satellites that are alone on a clock without a known bias, shape (T, K)."""
+    """Return a mask (T, K) of satellites whose clock has no other used satellite and no known bias."""
     alone = np.zeros(reason.shape, dtype=bool)
     for g, group in enumerate(groups):
         used = reason[:, group] == 0
@@ -147,8 +147,8 @@ _CONTRADICT: Final = 25.0
 def _consistent(
     agreeing: Ranges, free: SinglePoint, excluded: Masks, corrected: CorrectedRanges, scale: Floats, config: Config
 ) -> tuple[Ranges, SinglePoint]:
-    """Return ranges and 3-D positions for the test of the map. At inconsistent epochs, `excluded` satellites are
-    removed. Positions are NaN where the remaining ranges are inconsistent, or the faulty range cannot be identified.
+    """Return ranges and 3-D positions for the test of the map, without `excluded` satellites at inconsistent epochs.
+    Positions are NaN where the remaining ranges are inconsistent, or the faulty range cannot be identified.
     """
     wrong = excluded & (agreeing.weight > 0) & _contradict(free, agreeing.space_redundancy, scale)[:, None]
     changed = np.flatnonzero(wrong.any(axis=1))
@@ -162,7 +162,7 @@ def _consistent(
 
 
 def _contradict(point: SinglePoint, freedom: Integers, scale: Floats) -> Masks:
-    """Return the epochs whose ranges (redundancy `freedom`) are inconsistent with a 3-D position, shape (T,)."""
+    """Return a mask (T,) of epochs whose ranges, with redundancy `freedom`, fit no 3-D position."""
     return np.asarray((freedom >= 1) & (point.wsse > _CONTRADICT * freedom * np.maximum(scale, 1.0) ** 2))
 
 
@@ -221,11 +221,10 @@ def _nominal_variance_m2(model: LinearModel, nominal_elevation_sigma_m: Floats) 
 
 
 def _ambiguity_variance_m2(ranges: Ranges, antennas: AntennaRows, fix: LineFix, arc: Floats, config: Config) -> Floats:
-    """Return the squared distance to the best alternative position times its probability (T,) [m^2]; 0 if there is
-    none.
+    """Return the squared distance to the best alternative position, times its probability, shape (T,) [m^2].
 
-    With weighted squares larger by the excess x, the alternative has the probability ``1/(1 + exp(x/2))`` (normal
-    likelihoods, equal priors).
+    If its weighted sum of squares is larger by x, its probability is ``1/(1 + exp(x/2))`` (normal likelihoods, equal
+    priors).
     """
     section, square = fix.section, np.zeros(len(ranges))
     open_ones = (section.other_vertex >= 0) & (section.excess <= config.section.threshold) & np.isfinite(arc)

@@ -1,9 +1,9 @@
-"""Positioning of chunks of epochs, from observations to the results of the filter.
+"""Process chunks of epochs, from observations to filter results.
 
-`EpochProcessor` has the constant data of a run (settings, trajectories, error model). `process` takes a chunk of
-observations, the navigation records, SBAS messages and sensor samples received since the previous chunk, and the state
-after the previous chunk. It returns every intermediate result and the new state. A live epoch is a chunk of length one;
-the results do not depend on the division into chunks.
+`EpochProcessor` contains the constant data of a run (settings, trajectories, error model). Its method `process`
+requires a chunk of observations, the other data received since the previous chunk, and the previous state. It returns
+every intermediate result and the new state. The results do not depend on the division into chunks; a live epoch is a
+chunk of length one.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ from railfix.tracking import Line
 
 
 class EpochProcessor:
-    """Positions on the line from chunks of observations.
+    """Processor that computes positions on the line from chunks of observations.
 
     Parameters
     ----------
@@ -76,18 +76,18 @@ class EpochProcessor:
         The files named in the configuration are not read; pass their contents, as
         `railfix.run.processor_setup.make_processor` does.
     trajectories : mapping of str to Trajectory
-        Trajectories of the antennas "front", "rear", or both.
+        Trajectory of each antenna; the names of the antennas are "front" and "rear".
     navigation : Navigation, optional
-        Navigation records known from the start; further records can be passed with each chunk. Without records here,
-        `process` raises `SettingsError` unless records are given with the first chunk.
+        Navigation records known from the start; further records can be passed with each chunk. If they are omitted, the
+        first chunk must include records; otherwise `process` raises `SettingsError`.
     corrections : MessageCorrections, optional
-        SBAS corrections (`railfix.ranges.sbas.SbasState`) from the messages known from the start, required if and only
-        if ``config.sbas`` requests SBAS. Further messages can be passed with each chunk.
+        SBAS corrections (`railfix.ranges.sbas.SbasState`) from the messages known from the start. They are required if
+        ``config.sbas`` requests SBAS, and rejected otherwise. Further messages can be passed with each chunk.
     models : Models, optional
     stations : Stations, optional
     screens : sequence of Screen, optional
         User-defined screens, used with their limits in addition to the screens of `config`. Their verdicts are in
-        `AntennaResult.screens`; the tables have columns for built-in screens and screens of installed packages only.
+        `AntennaResult.screens`, but not in the columns of the tables.
 
     Attributes
     ----------
@@ -105,10 +105,10 @@ class EpochProcessor:
     Raises
     ------
     SettingsError
-        SBAS is combined with precise ephemerides, `config.sbas` and `corrections` do not match, or an argument has a
-        wrong type.
+        SBAS is combined with precise ephemerides, only one of `config.sbas` and `corrections` is given or their
+        frequencies differ, or an argument has a wrong type.
     ValueError
-        The trajectories have different map sigmas, or a screen has the name of a screen of railfix.
+        The trajectories have different map sigmas, or a user-defined screen has the name of a built-in screen.
     """
 
     def __init__(
@@ -180,12 +180,12 @@ class EpochProcessor:
         return ThreadPoolExecutor(len(self.trajectories))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return everything except the threads; another process creates threads of its own."""
+        """Return the attributes to pickle: all except the threads, which each process creates itself."""
         return {name: value for name, value in self.__dict__.items() if name != "_threads"}
 
     @cached_property
     def lines(self) -> dict[str, Line]:
-        """Lines of the filter along the track, by antenna."""
+        """Trajectory of each antenna in the form that the along-track filter uses."""
         return {name: Line(trajectory) for name, trajectory in self.trajectories.items()}
 
     @property
@@ -194,7 +194,7 @@ class EpochProcessor:
         return (*self.received.notes, *self._lacking)
 
     def _inactive_notes(self) -> tuple[str, ...]:
-        """Return one sentence for each part of the settings that cannot be satisfied."""
+        """Return one sentence for each setting that cannot be satisfied."""
         asked = self.config.model_fields_set
         notes = []
         for screen, limits in self.screens:
@@ -220,7 +220,7 @@ class EpochProcessor:
     ) -> tuple[Result, State]:
         """Return the positions of one chunk, and the state for the next chunk.
 
-        Each note and doubt of the result becomes a `RailfixWarning`, except notes on default screens without input.
+        Each note and doubt of the result is also a `RailfixWarning`, except notes on default screens without input.
 
         Parameters
         ----------
@@ -244,8 +244,7 @@ class EpochProcessor:
         ValueError
             The epochs of an antenna are not in ascending order, or do not begin after the last epoch of `state`.
         SettingsError
-            One of the conditions of the class applies, an antenna has no trajectory, or there are no navigation
-            records.
+            A condition listed for the class applies, an antenna has no trajectory, or there are no navigation records.
         """
         if navigation is None and state is None and not self._navigation_given:
             raise SettingsError("no navigation records: EpochProcessor(..., navigation=read_navigation(file))")
@@ -267,10 +266,10 @@ class EpochProcessor:
         sensors: SensorSamples | None = None,
         base: Observations | None = None,
     ) -> tuple[Chunk, State]:
-        """Apply the screens to the ranges of one chunk: the first part of `process`, with the parameters of `process`.
+        """Apply the screens to the ranges of one chunk: the first part of `process`, with the same parameters.
 
-        The parts of `process` use and replace different members of the state. Different parts can therefore process
-        successive chunks at the same time, if each part keeps a state of its own.
+        The three parts of `process` use and replace different members of the state. Different parts can therefore
+        process successive chunks at the same time, if each part keeps a state of its own.
         """
         if not (isinstance(observations, Mapping) and observations):
             raise SettingsError("observations: pass one log for each antenna, and at least one: {'front': log}")
@@ -394,18 +393,18 @@ class EpochProcessor:
         return dict(zip(chunk.names, over_antennas(one_antenna, chunk.names), strict=True))
 
     def _curve_notes(self, headers: Mapping[str, ObservationHeader]) -> Iterator[str]:
-        """Yield notes on a C/N0 curve of a different antenna or receiver."""
+        """Yield a note for each log whose antenna or receiver differs from that of the C/N0 curve."""
         if (curve := self.setup.cn0_curve) is not None and "cn0" in self.config.screens:
             for name, header in headers.items():
                 yield from (f"{name}: {note}" for note in curve.notes_for(header))
 
     def _line_references(self, name: str) -> LineReferences:
-        """Return ground units, balises, and, if the filter uses them, the features of the line."""
+        """Return the ground units, the balises, and the line features if the filter uses features."""
         features = self._features.get(name) if "feature" in self.config.filter_sources else None
         return LineReferences(features=features, units=self.units, balises=self.balises)
 
     def _pair(self, time: Datetimes, near_arc_m: Floats, rows: Mapping[str, slice]) -> PairedEpochs | None:
-        """Return the common epochs of two antennas of one vehicle; None without such antennas."""
+        """Return the common epochs of two antennas of one vehicle; None if there are no two such antennas."""
         if len(rows) < 2 or not self.setup.spacing_known:
             return None
         front, rear = rows["front"], rows["rear"]

@@ -34,7 +34,7 @@ class AntennaState(NotebookTable):
     offsets: OffsetState = field(default_factory=OffsetState)  #: Inter-system biases estimated so far.
     screens: Mapping[str, Any] = field(default_factory=dict)  #: States of the screens with memory, by name.
     carrier: CarrierState | None = None  #: State of the carrier-phase stages, if used.
-    #: Last epoch; NaT before the first.
+    #: Time tag of the last epoch; NaT before the first epoch.
     ended: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     #: Mean differences of the satellites' two codes.
     two_frequencies: TwoFrequencyState = field(default_factory=TwoFrequencyState)

@@ -28,17 +28,17 @@ class RangeErrorModel(Protocol):
 
     @property
     def covers(self) -> Literal["local", "satellite_and_atmosphere"]:
-        """Whether the model covers local errors alone, or satellite and atmospheric errors as well."""
+        """Errors that the model covers: local errors alone, or satellite and atmospheric errors as well."""
 
     @property
     def conditions(self) -> Conditions | None:
         """Settings under which the model is valid; None if unknown."""
 
     def at(self, elevation_deg: Floats, relative_azimuth_deg: Floats, cn0_dbhz: Floats) -> tuple[Floats, Floats]:
-        """Return the overbounding sigma and bias of observations, shape (T, K) [m]; NaN without a value."""
+        """Return the overbounding sigma and bias of observations, shape (T, K) [m]; NaN where unknown."""
 
     def missing_parts(self) -> tuple[str, ...]:
-        """Return a sentence on each missing part of a model that an earlier version of railfix wrote."""
+        """Return a sentence for each part that is missing because an earlier version wrote the model."""
 
 
 class Models(NamedTuple):

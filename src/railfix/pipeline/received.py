@@ -57,7 +57,7 @@ class MessageCorrections(Protocol):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """One sentence on each correction that was requested and used, and on the messages of a recorded log."""
+        """Notes on the corrections and on the messages of a recorded log, one sentence each."""
 
     @property
     def dual_frequency(self) -> bool:
@@ -85,7 +85,7 @@ class Received:
     corrections: MessageCorrections | None = None  #: Corrections from SBAS messages; None without SBAS.
     #: Ionospheric coefficients in use, shape (8,); None if the ionosphere is uncorrected, or corrected by SBAS.
     klobuchar: Floats | None = None
-    #: Standard deviation of the vertical delay if typical coefficients replace broadcast ones, otherwise 0.
+    #: Standard deviation of the vertical ionospheric delay if typical coefficients replace broadcast ones, otherwise 0.
     ionosphere_sigma_m: float = 0.0
     notes: tuple[str, ...] = ()  #: One sentence on each replacement of requested data.
     base: BaseErrors | None = None  #: Range errors measured by a base station.
@@ -126,7 +126,7 @@ def known_from_start(
 
 
 def check_corrections(config: Config, corrections: MessageCorrections | None) -> None:
-    """Raise SettingsError if only one of SBAS setting and corrections is given, or if their frequencies differ."""
+    """Raise SettingsError if only SBAS settings or only corrections are given, or if their frequencies differ."""
     if bool(config.sbas) != (corrections is not None):
         given, state = "not given" if corrections is None else "given", "on" if config.sbas else "off"
         raise SettingsError(
@@ -146,7 +146,7 @@ def receive(
     navigation: Navigation | None = None,
     messages: Any = None,
 ) -> Received:
-    """Return the received data after new navigation records and messages; return `before` without new data.
+    """Return the received data after new navigation records and messages; return `before` if there are none.
 
     `time` is the time of the next epoch, NaT if unknown. Messages that no epoch from `time` on can use are dropped.
     Repeated and expired records are dropped as well, except for a satellite's newest record. Newer coefficients and

@@ -46,9 +46,9 @@ class Column(Generic[Source]):
 
     name: str  #: Name, ending with the unit if there is one: ``along_sigma_m``.
     meaning: str
-    #: Attribute path of the values in the source of a table (``raim.statistic``), by default the name. Otherwise a
-    #: function of the source, or None if the source lacks the values. The values are an array with epochs on axis 0, or
-    #: one value for all rows. If the column has `words`, the values are indices of words.
+    #: Where the source of a table has the values: an attribute path (``raim.statistic``; by default the name) or a
+    #: function of the source; None if the source lacks them. The values are an array with epochs on axis 0, or one
+    #: value for all rows. If the column has `words`, the values are indices of words.
     values: str | Callable[[Source], NDArray[Any] | str | None] | None = ""
     dtype: pl.DataType = field(default=pl.Float64(), kw_only=True)
     words: tuple[str, ...] = field(default=(), kw_only=True)  #: Words to which integer values refer, by index.
@@ -142,7 +142,7 @@ class Observed:
     tracked: AlongTrack | None = None
 
     def on_all_channels(self, values: Floats | None) -> Floats:
-        """Return values of the positioning channels, spread over all channels, shape (T, M); NaN elsewhere."""
+        """Return `values` of the positioning channels as an array of all channels, shape (T, M), NaN elsewhere."""
         return self.result.on_all_channels(np.nan if values is None else values)
 
     def innovation(self, kind: Kind) -> Floats:
@@ -173,7 +173,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         *EPOCH,
         Column("status", "see `railfix.core.reasons.Status`", words=tuple(s.text for s in Status)),
         *ON_LINE,
-        Column("along_sigma_m", "standard deviation along the line, including alternatives of an ambiguous epoch"),
+        Column("along_sigma_m", "standard deviation along the line, including unresolved alternative positions"),
         Column(
             "own_sigma_m",
             "single-epoch sigma, computed from the codes of the epoch alone; the status is `uncertain` above "
@@ -199,8 +199,8 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         Column("raim_threshold", "threshold of the statistic, above which a fault is detected", "raim.threshold"),
         Column(
             "raim_level_m",
-            "protection level of P4: error caused by a fault that RAIM misses, plus noise; infinite if a satellite is "
-            "unchecked, empty if a fault remains",
+            "protection level of P4: error caused by a fault that RAIM misses, plus noise; infinite if a satellite "
+            "cannot be checked, empty if a fault remains",
             "raim.protection_level_m",
         ),
         Column(
@@ -239,7 +239,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "protection_separation",
-            "largest ratio of the separation of a fault hypothesis to the threshold of the separation",
+            "largest ratio of the solution separation of a fault hypothesis to its threshold",
             "protection.level.separation",
         ),
         Column(
@@ -316,7 +316,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         Column(
             "interference",
             "`none`, `jamming_suspected` or `spoofing_suspected`, even where the status differs; or another cause of "
-            "the signs: `time_tags`, `left_map`, `contradicted`",
+            "the signs of interference: `time_tags`, `left_map`, `contradicted`",
             "interference.suspicion",
             words=tuple(s.name.lower() for s in Suspicion),
         ),
@@ -327,7 +327,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
             dtype=pl.String(),
         ),
         Column(
-            "cn0_fall_db", "median fall of C/N0 of the satellites below their recent peak", "interference.power.fall_db"
+            "cn0_fall_db", "median drop of the satellites' C/N0 below its recent peak", "interference.power.fall_db"
         ),
         Column("conventional_x_m", "3-D single point, ECEF", lambda r: r.point.ecef_m[:, 0]),
         Column("conventional_y_m", "3-D single point, ECEF", lambda r: r.point.ecef_m[:, 1]),

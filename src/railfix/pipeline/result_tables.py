@@ -1,4 +1,4 @@
-"""Results as tables: polars for files and analysis, xarray for arrays with names.
+"""Results as tables: polars for files and analysis, xarray for arrays with named axes.
 
 Times are in GPS time without a time zone, to the nanosecond. Absent values are null in polars and NaN in xarray.
 """
@@ -187,7 +187,7 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
             lambda r: r.direction + 1,
             words=("falling", "unknown", "rising"),
         ),
-        Column("standstill", "whether the speed plus two sigmas is below 1 km/h", dtype=pl.Boolean()),
+        Column("standstill", "true if the speed plus two sigmas is below 1 km/h", dtype=pl.Boolean()),
         Column(
             "branch_probability",
             "probability of the published position, as opposed to other positions on the line",
@@ -205,8 +205,8 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
             "protection level of the straight distance to the train, valid also on another lap or off the map",
             "tracked.ground_level_m",
         ),
-        Column("protection_noise_m", "part of the protection level for noise without a fault", "tracked.level_noise_m"),
-        Column("protection_separation_m", "largest separation of a sub-filter", "tracked.separation_m"),
+        Column("protection_noise_m", "part of the protection level for fault-free noise", "tracked.level_noise_m"),
+        Column("protection_separation_m", "largest separation of a sub-filter from the filter", "tracked.separation_m"),
         Column(
             "protection_unchecked",
             "probability of faults that the level does not bound: a fault of the only constellation in view",
@@ -214,8 +214,8 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         ),
         Column(
             "over_reading_m",
-            "largest distance of the train behind the position: the level, or 2 % of the distance since codes were "
-            "used, if larger (`L_DOUBTOVER` minus `Q_LOCACC`)",
+            "largest distance of the train behind the position: the protection level, or 2 % of the distance "
+            "since codes were used, if larger (`L_DOUBTOVER` minus `Q_LOCACC`)",
             "tracked.amount_m",
         ),
         Column("under_reading_m", "largest distance of the train ahead (`L_DOUBTUNDER`)", "tracked.amount_m"),
@@ -366,7 +366,8 @@ PASSING_COLUMNS: Final[Mapping[str, Column[Sequence[Passing]]]] = by_name(
                dtype=_TIME),
         Column("earliest_gpst", "earliest time of the passing that the protection level allows",
                _getter("earliest"), dtype=_TIME),
-        Column("latest_gpst", "latest time that the protection level allows", _getter("latest"), dtype=_TIME),
+        Column("latest_gpst", "latest time of the passing that the protection level allows",
+               _getter("latest"), dtype=_TIME),
         EPOCH[1],
         Column("balise", "name in the list, or identity that was read", _getter("balise"), dtype=pl.String()),
         Column(

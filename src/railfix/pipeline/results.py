@@ -28,10 +28,10 @@ from railfix.track.trajectory import Trajectory
 
 @dataclass(frozen=True, kw_only=True)
 class AntennaResult(Solution, LineCoordinates, NotebookTable):
-    """Results of one antenna at T epochs: positions, except those that the status drops, and intermediate results.
+    """Positions and intermediate results of one antenna at T epochs.
 
-    Range arrays have the K channels that the settings allow (`corrected`). Properties have all M channels of the
-    observations. If the observations of several antennas were processed together, these include all antennas' channels.
+    Arrays of `corrected` have K channels, which are those that the settings allow. Properties have M channels, which
+    are all observed channels of all antennas that were processed together.
     """
 
     trajectory: Trajectory  #: Trajectory of the antenna.
@@ -93,7 +93,7 @@ class AntennaResult(Solution, LineCoordinates, NotebookTable):
         return np.asarray((seen & ~used).sum(axis=1), dtype=np.int64)
 
     def on_all_channels(self, values: Floats | float) -> Floats:
-        """Return values of the allowed channels, shape (T, K), spread over all channels, (T, M); NaN elsewhere."""
+        """Return `values` of the K allowed channels as an array of all channels, shape (T, M), NaN elsewhere."""
         full = np.full(self.corrected.observations.code_m.shape, np.nan)
         full[:, self.corrected.columns] = values
         return full
@@ -115,7 +115,7 @@ class AntennaResult(Solution, LineCoordinates, NotebookTable):
 
     @property
     def bound_sigma_m(self) -> Floats:
-        """Minimum sigma of each range in the level, from the error model; 0 without a model; shape (T, M)."""
+        """Minimum range sigmas of the protection level, from the error model (0 without one), shape (T, M)."""
         return self.on_all_channels(self.corrected.bound_sigma_m)
 
     @property
@@ -135,17 +135,17 @@ class AntennaResult(Solution, LineCoordinates, NotebookTable):
 
     @property
     def conventional_arc_m(self) -> Floats:
-        """Arc length of the point of the trajectory nearest to the 3-D single point, shape (T,)."""
+        """Arc length of the trajectory point nearest to the conventional 3-D position, shape (T,)."""
         return self._nearest[0]
 
     @property
     def conventional_offset_m(self) -> Floats:
-        """Distance of the 3-D single point from the nearest point of the trajectory, shape (T,) [m]."""
+        """Distance of the conventional 3-D position from the trajectory, shape (T,) [m]."""
         return self._nearest[1]
 
     @property
     def conventional_chainage_m(self) -> Floats:
-        """Chainage of the point of the trajectory nearest to the 3-D single point, shape (T,) [m]."""
+        """Chainage of the trajectory point nearest to the conventional 3-D position, shape (T,) [m]."""
         return self.trajectory.chainage_at(self.conventional_arc_m)
 
     def __len__(self) -> int:
@@ -159,13 +159,13 @@ class AntennaResult(Solution, LineCoordinates, NotebookTable):
         return f"{int((self.status == Status.OK).sum()):,} of {plural(self, 'epoch')} ok"
 
     def summary(self) -> dict[str, str]:
-        """Return the medians of sigma and level in metres, as strings."""
+        """Return the medians of sigma and protection level in metres, as strings."""
         level = np.empty(0) if self.protection is None else self.protection.level.level_m
         return {"median sigma [m]": median_text(self.along_sigma_m), "median level [m]": median_text(level)}
 
 
 def antenna_results(chunk: Chunk, fusion: Mapping[str, AlongTrack], config: Config) -> dict[str, AntennaResult]:
-    """Return the single-epoch results by antenna, without coordinates that the final status drops.
+    """Return the single-epoch results by antenna; positions are NaN where the final status drops them.
 
     If the filter along the track is on, its comparison with wheel distances can add a sign of interference.
     """

@@ -1,4 +1,4 @@
-"""Observation and position screens, combination of frequencies and carrier smoothing, over all antennas."""
+"""Apply screens, the combination of two frequencies, and carrier smoothing to all antennas."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ _MEAN_NS: Final = 200_000_000
 _FAULT_NS: Final = _MEAN_NS + 150_000_000
 #: Length of time before the last epoch from which the next chunk needs samples.
 REACH: Final = np.timedelta64(_MEAN_NS + 200_000_000, "ns")
-#: States whose distance is taken from the inertial unit.
+#: Motion states in which the inertial unit provides the distance.
 CARRIED: Final = (
     MotionState.STANDING,
     MotionState.LOW_SPEED,
@@ -69,7 +69,7 @@ class SensedMotion:
 
     state: Codes  #: `railfix.motion.slip.MotionState`; INIT without both sensors; shape (T,).
     distance_m: Floats  #: Forward distance by inertia where the state is one of `CARRIED`, NaN elsewhere; shape (T,).
-    doubt_mps: Floats  #: Largest slip speed of a slip not yet detected, shape (T,).
+    doubt_mps: Floats  #: Largest slip speed that an undetected slip can have, shape (T,).
     #: Part of the mean forward specific force due to pitching of the body, 0 without a gyro; shape (T,).
     swing_mps2: Floats
     #: Gradient of the line under the body toward rising arc length, from wheel and accelerometer (P2 2.3); an offset of
@@ -122,9 +122,9 @@ def sensed_motion(
 ) -> tuple[SensedMotion, RateSeries | None, SensedState]:
     """Return the motion between `edges`, the body rates (None without a sample), and the state for the next chunk.
 
-    Signed pulses and inertial samples begin `REACH` before the first of the T + 1 `edges`. `sine_at` gives the sine of
-    the gradient in rising arc length at arc lengths; the trajectory of the antenna determines the direction of the
-    front, and the position of the body.
+    Signed pulses and inertial samples begin `REACH` before the first of the T + 1 `edges`. `sine_at` returns the sine
+    of the gradient, in rising arc length, at given arc lengths. The antenna's trajectory determines the direction of
+    the front and the position of the body.
     """
     facing = trajectory.front_sign
     ends = edges.astype("datetime64[ns]").astype(np.int64)

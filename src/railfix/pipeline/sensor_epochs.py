@@ -94,7 +94,7 @@ class SensorLimits(Settings):
 class SensorState:
     """Samples and states needed by the next chunk."""
 
-    time: np.datetime64  #: Last epoch; NaT before the first.
+    time: np.datetime64  #: Time tag of the last epoch; NaT before the first epoch.
     samples: SensorSamples
     motion: SensedState = field(default_factory=SensedState)
     features: FeatureState = field(default_factory=FeatureState)

@@ -24,10 +24,10 @@ from railfix.positioning.range_arrays import InterSystemBiases
 class ProtectionResult(NotebookTable):
     """Protection levels of T epochs."""
 
-    #: Levels, with the channels of the ranges; NaN without a position, or if a fault remains after RAIM.
+    #: Protection levels; NaN at epochs without a position, or with a fault that remains after RAIM.
     level: ProtectionLevel
     status: Codes  #: `protection.LevelStatus` against `Config.alarm_limit_m`, shape (T,).
-    kind: str  #: Hypotheses of the levels: "sbas" or "separation" (`level_stage.KINDS`).
+    kind: str  #: Fault hypotheses of the levels: "sbas" or "separation" (`level_stage.KINDS`).
     basis: str  #: "measured" or "indicative": whether the priors were measured on the line (`level_stage.BASES`).
 
 
@@ -44,8 +44,8 @@ class Solution(NotebookTable):
     ties: InterSystemBiases  #: Inter-system biases known before each epoch, by `Channels.clocks`.
     raim: RaimResult  #: Result of RAIM; `outcome` is UNTESTABLE at all epochs if the screen is off.
     status: Codes  #: `reasons.Status`, shape (T,).
-    #: Range standard deviation of the receiver divided by the value that the weights assume: root mean square of the
-    #: normalised residuals after RAIM over previous epochs, with exponential forgetting; shape (T,).
+    #: Ratio of the receiver's range standard deviation to the assumed value, shape (T,): root mean square of the
+    #: normalised residuals after RAIM over previous epochs, with exponential forgetting.
     noise_scale: Floats
     #: Single-epoch sigma: standard deviation along the line from the codes of the epoch alone. It uses the larger of
     #: the receiver's noise and the noise estimated from the epoch's residuals, and is widened by Student's t where few
@@ -67,6 +67,6 @@ class Solution(NotebookTable):
 
 @lru_cache
 def with_coordinates(failed_checks: str) -> Masks:
-    """Return whether positions have coordinates, by status number, for a value of `Config.failed_checks`."""
+    """Return a mask by status number: true if positions of that status have coordinates under `failed_checks`."""
     dropped = CHECK_FAILED if failed_checks == "drop" else ()
     return read_only(np.array([status in POSITIONED and status not in dropped for status in sorted(Status)]))

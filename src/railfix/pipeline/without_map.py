@@ -1,4 +1,4 @@
-"""Positions and ranges of a log without a track map: conventional positions, survey epochs."""
+"""Positions and ranges of a log without a track map, for conventional positions and for surveys."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _EARTH_RADIUS_M: Final = 6.371e6
 _HEIGHTS_M: Final = (-500.0, 10_000.0)
 #: Height range of the tropospheric model [m].
 _MODELLED_HEIGHTS_M: Final = (-100.0, 10_000.0)
-#: Gross errors are searched for if the root mean square of raw residuals, with atmospheric delays, exceeds this [m].
+#: The search for gross errors starts if the rms of the residuals, before atmospheric corrections, exceeds this [m].
 _QUIET_M: Final = 10.0
 
 
@@ -77,8 +77,8 @@ class Located:
 
     time: Datetimes  #: Time tags, shape (T,).
     ecef_m: Floats  #: NaN without a position, shape (T, 3).
-    #: Standard deviations north, east and up, from the range sigmas including atmosphere and orbits, scaled up by large
-    #: residuals; shape (T, 3).
+    #: Standard deviations north, east and up, shape (T, 3), from range sigmas that include atmospheric and orbit
+    #: errors. They are scaled up if residuals are large.
     sigma_m: Floats
     n_used: Integers  #: Number of satellites used, shape (T,).
     no_position: Codes  #: `NoPosition` of each epoch, shape (T,).
@@ -227,7 +227,7 @@ def survey_run(
 ) -> SurveyRun:
     """Return the survey run of a log, read in parts, with its ranges and range changes.
 
-    Range changes are not formed between two parts. Raise ValueError if fewer than three epochs have a position.
+    No range change spans two parts. Raise ValueError if fewer than three epochs have a position.
     """
     book, slips = ChannelBook(config), None
     runs: list[SurveyRun] = []

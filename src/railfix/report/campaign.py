@@ -32,7 +32,7 @@ _PIECES: Final = 400
 #: Maximum number of runs in a chart with one bar per run. The runs with the largest values are drawn; the table has all
 #: runs.
 _BARS: Final = 40
-#: Quantities by which the worst epochs are selected: the first for which there are values.
+#: Quantities that can select the worst epochs; the first quantity that has values is used.
 _QUANTITIES: Final = ("error_m", "protection_level_m", "along_sigma_m")
 _FIGURES: Final[Sequence[Column]] = (
     ("epochs", "epochs", count),

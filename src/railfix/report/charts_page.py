@@ -130,7 +130,7 @@ def sky_values(sky: SkyEpochs) -> dict[str, Any]:
     return values
 
 
-#: Number of levels of lists in which the lists of points are nested, by type of geometry (RFC 7946).
+#: Depth at which the lists of points are nested, by type of geometry (RFC 7946).
 _DEPTH: Final = {"LineString": 0, "MultiLineString": 1, "Polygon": 1, "MultiPolygon": 2}
 _IGNORED: Final = ("Point", "MultiPoint")
 

@@ -104,9 +104,9 @@ def _availability(run: ReportedRun) -> Table:
         name="availability",
         head=["antenna", "levels", "limit, m", "epochs", "finite", "p50", "p95", "available", "15 s", "60 s"],
         rows=list(_rows_available(run, limits, options)),
-        caption=f"Fraction of all epochs that are available, and of the windows of 15 s and 60 s beginning at an "
-        f"available epoch that stay available. {_EXPLAINED}. Levels are in metres; without a reference they are not "
-        "compared with errors",
+        caption="Fraction of all epochs that have an available level; and, of the windows of 15 s and 60 s that begin "
+        f"at such an epoch, the fraction in which the level stays available. {_EXPLAINED}. Levels are in metres; "
+        "without a reference they are not compared with errors",
         numeric=range(2, 10),
     )
 
@@ -149,7 +149,7 @@ def overview(run: ReportedRun, antenna: str, background: Sequence[Floats] = ()) 
     """Return the plan of the line and a chart over chainage for one antenna.
 
     The chart over chainage shows errors. Without a reference it shows protection levels or, if there are none,
-    intervals.
+    distances between consecutive positions.
     """
     positions, errors = run.get_positions(antenna), run.get_errors(antenna)
     if errors is not None:

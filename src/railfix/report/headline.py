@@ -108,9 +108,7 @@ def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, passed:
 
 
 def _verdict_figures(run: ReportedRun, antenna: str) -> dict[str, KeyFigure]:
-    """Return an antenna's key figures from the verdict on the run, by name; no key figures if ``run.json`` lacks the
-    antenna.
-    """
+    """Return an antenna's key figures from the verdict on the run, by name; empty if ``run.json`` has none."""
     found = next((each for each in judge_run(run.record).antennas if each.antenna == antenna), None)
     if found is None:
         return {}

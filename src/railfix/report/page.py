@@ -37,7 +37,7 @@ from railfix.report.plots.signals import SKY_EPOCHS
 from railfix.report.runs import ReportedRun, get_figures, read_runs
 from railfix.run.record import budget_tables, level_basis
 
-#: Errors in the table of all runs: for each name in the header, the kind of position and the table of positions.
+#: Errors in the table of all runs: the kind of position and the table of positions, by the name in the header.
 _JUDGED: Final = {
     "filter": ("constrained", "train"),
     "single epochs": ("constrained_ok", POSITIONS_TABLE),
@@ -70,9 +70,9 @@ def summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> Table
                     row += [number(figures.get(k)) for k in ("p95_m", "max_m")]
             rows.append(row)
     caption = (
-        "The column of settings has the preset and the settings that differ from it. The rate is the fraction of the "
-        "epochs with observations that have a position. Sigma p95 is the 95th percentile of the stated standard "
-        "deviation along the line, in metres"
+        "The column of settings has the preset and the settings that differ from it. The rate is the number of "
+        "positions divided by the number of epochs with observations. Sigma p95 is the 95th percentile of the stated "
+        "standard deviation along the line, in metres"
     )
     if evaluation:
         caption += (

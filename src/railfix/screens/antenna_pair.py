@@ -1,8 +1,8 @@
 """Comparison of the pseudoranges of two antennas, given their spacing (P1 2.3(3), figure 5, table 6: 5 m).
 
 The range from the rear antenna to a satellite is longer by ``L (cos el cos(az - heading) cos gradient + sin el sin
-gradient)``, with L the antenna spacing. Any other difference indicates multipath at one of the two antennas, but does
-not show at which one.
+gradient)``, with L the antenna spacing. A deviation from this difference indicates multipath at one of the two
+antennas, but not at which one.
 
 If `clocks` is "common", the receivers must share a clock: at epochs where the median difference exceeds
 `SEPARATE_CLOCKS_M`, no satellite is tested (P1 6). If `clocks` is "median", the clock difference is estimated by the
@@ -69,7 +69,7 @@ class AntennaPairLimits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class AntennaPairScreened(Screened):
-    """Verdict on P pairs of epochs, C pairs of channels; the metric is measured minus expected difference [m]."""
+    """Verdict on P pairs of epochs and C pairs of channels; the metric is measured minus expected difference [m]."""
 
     expected_m: Floats  #: Rear minus front pseudorange expected from the spacing [m], shape (P, C).
     #: Eliminated clock difference [m], rear minus front; 0 for a common clock; NaN if unknown; shape (P, C).

@@ -1,7 +1,7 @@
 """Base classes of the screens: inputs and results of a screen, and the methods that a screen may override.
 
-A screen is one subclass of `ObservationScreen`, `PairScreen` or `PositionScreen`, and one line in
-`railfix.screens.registry`, or one entry point of an installed package (docs/screens.md shows an example).
+A new screen is a subclass of `ObservationScreen`, `PairScreen` or `PositionScreen`. It is registered by a line in
+`railfix.screens.registry`, or by an entry point of an installed package (docs/screens.md shows an example).
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class OpenSkyCn0(Protocol):
         """Return the mean C/N0 of channels at their elevations, shape (T, M) [dB-Hz]; NaN where unknown."""
 
     def notes_for(self, header: ObservationHeader) -> tuple[str, ...]:
-        """Return a sentence if a log's header names another antenna than the curve, and likewise for the receiver."""
+        """Return a sentence for each of antenna and receiver that differs between the log's header and the curve."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,7 +97,7 @@ class ObservationPicture(NamedTuple):
     label: str
     metric: str  #: Column of the observations.
     reason: Reason  #: Reason of the rejected observations.
-    limit: str  #: Field of the screen's limits (no picture if None), or column of the observations.
+    limit: str  #: Field of the screen's limits (if it is None, there is no picture), or column of the observations.
     sides: Literal["both", "above", "below"] = "both"
 
 
@@ -115,7 +115,7 @@ class RunTables(Protocol):
 
 
 class Screen(ABC, Generic[Limits]):
-    """Base class of `ObservationScreen`, `PairScreen` and `PositionScreen`, from which a new screen is derived."""
+    """Base class of `ObservationScreen`, `PairScreen` and `PositionScreen`; derive new screens from these three."""
 
     name: ClassVar[str]  #: Name of the screen in `Config.screens`, and of its settings group.
     limits: Limits  #: Default limits; the type of this object defines the settings group.

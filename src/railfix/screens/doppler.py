@@ -46,7 +46,7 @@ class DopplerLimits(Settings):
     #: Largest deviation of a pseudorange change from its Doppler-derived value up to `short_interval_s`; P1 table 6:
     #: 1.5.
     step_m: float = Field(default=1.5, gt=0.0, allow_inf_nan=False)
-    #: Interval up to which the limit is constant. The default allows for one lost epoch at the 0.1 s of P1.
+    #: Interval up to which the limit is constant. The default allows for one lost epoch at P1's interval of 0.1 s.
     short_interval_s: float = Field(default=0.2, gt=0.0, allow_inf_nan=False)
     #: Time over which the receiver smooths its pseudoranges. With 1 s, the fixed limit is 2.9 m at an interval of 1 s.
     correlation_s: float = Field(default=1.0, gt=0.0, allow_inf_nan=False)

@@ -164,7 +164,7 @@ class Chart:
 
     @property
     def common_axis(self) -> Literal["time", "chainage", ""]:
-        """Quantity on the x axis by which charts are zoomed together; "" if there is no such quantity."""
+        """Quantity on the x axis, by which charts are zoomed together; "" for a chart that is zoomed alone."""
         if self.start is not None:
             return "time"
         return "chainage" if self.x_label.startswith("chainage") else ""
@@ -269,7 +269,7 @@ def extremes(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
 
 
 def one_per_cell(x: Floats, y: Floats, *, cell: float, points: int = POINTS) -> Indices:
-    """Return the indices of points with at most one point per square cell; if there are few points, of all points.
+    """Return the indices of at most one point per square cell; if there are few points, return all indices.
 
     Points with NaN are omitted. If more than `points` points are left, the cells have the width `cell`, which is
     increased until at most `points` points are selected. Otherwise all points are selected.

@@ -274,9 +274,9 @@ def stanford(diagram: Stanford, *, title: str = "Stanford diagram") -> Chart:
         title=title,
         caption=f"{judged:,} epochs have an error: {regions}. Levels are available at "
         f"{100 * diagram.available_rate:.2f} % of all epochs"
-        f"{'; fraction of windows from an available epoch that stay available: ' + kept if kept else ''}. Right of "
-        f"the diagonal the error exceeds the level. Values above {top:g} m, including infinite levels, are counted in "
-        "the last cells. Darker cells have more epochs, on a logarithmic scale.",
+        f"{'; of the windows beginning at such an epoch, the level stays available in: ' + kept if kept else ''}. "
+        f"Right of the diagonal the error exceeds the level. Values above {top:g} m, including infinite levels, are "
+        "counted in the last cells. Darker cells have more epochs, on a logarithmic scale.",
         x_label="absolute error along the line [m]",
         y_label="protection level [m]",
         layers=(

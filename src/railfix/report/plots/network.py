@@ -295,7 +295,7 @@ def plot_survey(surveyed: Surveyed, path: str | PathLike[str]) -> None:
 
 
 def plot_track_decision(decision: TrackDecision, path: str | PathLike[str], *, risk: float) -> None:
-    """Write a picture of the probability of each track, and of another track, over time, with the allowed risk."""
+    """Write a picture of the probability of each track, and of its complement with the allowed risk, over time."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 6), dpi=120)
