@@ -98,7 +98,7 @@ class Alignment(Knots):
         return np.asarray(self._curve(np.asarray(chainage_m, dtype=np.float64)))
 
     def tangent_at(self, chainage_m: ArrayLike) -> Floats:
-        """Return the tangents toward rising chainage, shape (..., 3), of length 1 within 1e-6."""
+        """Return tangent vectors toward rising chainage, shape (..., 3); their length is 1 within 1e-6."""
         return np.asarray(self._curve(np.asarray(chainage_m, dtype=np.float64), 1))
 
     def point_beside(self, chainage_m: Floats, lateral_m: float, height_m: float) -> Floats:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from railfix.simulate.signals import Simulation
 
 
-#: Spacing of instants; between two instants, the wheel's acceleration is assumed to be constant [s].
+#: Time step [s]; within a step, the wheel's acceleration is assumed to be constant.
 _STEP_S: Final = 0.01
 _LOOK_S: Final = 0.1  #: Time step of the search for phases of acceleration and braking [s].
 _HARD_MPS2: Final = 0.05  #: Minimum acceleration or deceleration in a phase of acceleration or braking [m/s^2].
@@ -127,9 +127,7 @@ def _times_at(target_m: Floats, node_s: Floats, turned_m: Floats, speed_mps: Flo
 
 
 def _miscount(time_s: Floats, settings: TachometerSettings, seed: int) -> Floats:
-    """Return the pulse times after random pulses have been removed, and random second pulses inserted before the next
-    tooth.
-    """
+    """Return the pulse times with random pulses removed, and with random extra pulses inserted before the next tooth."""
     if not (settings.lost_chance or settings.doubled_chance) or len(time_s) < 2:
         return time_s
     lost, doubled, part = np.random.default_rng([seed, _MISCOUNT]).uniform(size=(3, len(time_s)))

@@ -106,8 +106,7 @@ def _serving(records: KeplerRecords, satellite: str, first: np.datetime64, last:
     return np.asarray(rows[: len(rows) if served.all() else 0])
 
 
-#: Klobuchar coefficients in the form of GPS, alpha then beta; these fictitious values of usual size serve all
-#: constellations.
+#: Fictitious Klobuchar coefficients of realistic size, alpha then beta, for all constellations.
 KLOBUCHAR: Final = (1.118e-8, 2.235e-8, -5.960e-8, -1.192e-7, 1.044e5, 1.147e5, -6.554e4, -3.277e5)
 #: Time between the transmissions of two successive records [s] (IS-GPS-200: two hours).
 _ISSUE_S: Final = {"G": 7200, "J": 3600, "E": 3600, "C": 3600}
@@ -134,8 +133,8 @@ def simulate_navigation(scenario: Scenario) -> Navigation:
     """Return the broadcast records for the duration of a run.
 
     All values are rounded to the digits that `railfix.io.write_navigation` writes, so that file and arrays describe the
-    same satellites. If the scenario names a navigation file, the records are read by `navigation_of_file`, whose errors
-    are raised.
+    same satellites. If the scenario names a navigation file, `navigation_of_file` reads the records and may raise its
+    errors.
     """
     if scenario.sky.nav is not None:
         return navigation_of_file(scenario, scenario.sky.nav)
@@ -313,9 +312,7 @@ def record_state(
 
 
 def newest_record(records: KeplerRecords, satellite: str, time: Datetimes) -> Indices:
-    """Return, for each time, the row of the newest record of a satellite transmitted before, or else of the first
-    record.
-    """
+    """Return the row of the satellite's newest record transmitted before each time, or else its first record."""
     rows = np.flatnonzero(records.satellite == satellite)
     rows = rows[np.argsort(records.transmitted[rows], kind="stable")]
     return np.asarray(rows[np.maximum(np.searchsorted(records.transmitted[rows], time, side="right") - 1, 0)])

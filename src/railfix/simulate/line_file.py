@@ -1,8 +1,8 @@
 """Settings of the simulated line, and smooth curves through the points of a track file.
 
-The curve is a cubic spline in space (not-a-knot), whose arc length is the chainage. Cant is linear between points; the
-outer side follows from the file's radii, or from the curvature of the spline if the file has no radii. A file with a
-radius below 30 m is rejected.
+The curve is a cubic spline in space (not-a-knot), whose arc length is the chainage. Cant is linear between points. The
+side of the outer rail follows from the file's radii, or from the curvature of the spline if the file has no radii. A
+file with a radius below 30 m is rejected.
 """
 
 from __future__ import annotations
@@ -149,8 +149,8 @@ class LineSettings(ScenarioSettings):
 
     elements: tuple[Element, ...] = ()
     gradients: tuple[Gradient, ...] = ()  #: Gradients by rising chainage; without gradients, the line is level.
-    #: Length of the line. The pattern of 756 m is repeated, every second copy mirrored, and cut off at this length.
-    #: With `elements`, this is the sum of their lengths; for a file, `length_m` must be NaN.
+    #: Length of the line. The pattern of 756 m is repeated up to this length, with every second copy mirrored. With
+    #: `elements`, this is the sum of their lengths; for a file, `length_m` must be NaN.
     length_m: float = Field(default_factory=_length_m, allow_inf_nan=True)
 
     generated: GeneratedLine = GeneratedLine()

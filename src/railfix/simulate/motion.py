@@ -301,7 +301,7 @@ def antenna_truth(
 FULL_SPEED_MPS: Final = 20.0  #: Speed above which the random motions of the body have full amplitude [m/s].
 _STEP_S: Final = 0.01  #: Time step for the pitch response to accelerations [s].
 _DAMPING: Final = 0.3  #: Damping ratio of the suspension.
-_MARGIN_S: Final = 2.0  #: Margin before the start and after the end of the run for which pitch is computed [s].
+_MARGIN_S: Final = 2.0  #: Pitch is also computed for this time before and after the run [s].
 
 
 class BodyMotion:

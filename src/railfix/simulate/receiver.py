@@ -119,7 +119,7 @@ class TrackingNoise:
     def too_weak(self, cn0_dbhz: Floats) -> Masks:
         """Return whether signals are too weak to be tracked, shape (T, M).
 
-        A signal is too weak while it is below the threshold, and then until it reaches the re-acquisition C/N0.
+        A signal that falls below the threshold remains too weak until it reaches the re-acquisition C/N0.
         """
         threshold, again = self._settings.threshold_dbhz, self._settings.reacquisition_dbhz
         if threshold is None:
@@ -182,7 +182,7 @@ def list_signals(letter: str, settings: ReceiverSettings) -> tuple[str, ...]:
 
 
 class Receiver:
-    """M channels of a receiver (satellite and signal, in alphabetical order), with the state carried between chunks."""
+    """M channels of a receiver (satellite and signal, in alphabetical order), with state continued between chunks."""
 
     def __init__(
         self,

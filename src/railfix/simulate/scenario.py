@@ -60,7 +60,7 @@ class RunSettings(ScenarioSettings):
     deceleration_mps2: Positive = 0.8
     first_stand_s: NotNegative = 15.0  #: Duration of the standstill at the start of the run.
     stand_s: NotNegative = 10.0  #: Duration of the standstill at each end of the line, if no stations are given.
-    #: Distance between the end of the line and the middle of the vehicle where the train reverses.
+    #: Distance from an end of the line at which the middle of the vehicle stops before the train reverses.
     end_margin_m: NotNegative = 20.0
     #: Stops by rising chainage, including the first and the last; without stations, the train runs from end to end.
     stations: tuple[Station, ...] = ()
@@ -119,7 +119,7 @@ class SkySettings(ScenarioSettings):
     cutoff_deg: float = Field(default=5.0, ge=0.0, lt=90.0)  #: Elevation below which no signal is tracked.
     #: Satellites whose records are unhealthy, except for the record before the run.
     unhealthy: tuple[str, ...] = ("G02",)
-    #: Largest number of tracked satellites at an epoch, the highest in the sky; None for no limit.
+    #: Largest number of satellites tracked at an epoch, the highest first; None for no limit.
     satellites_at_most: Annotated[int, Field(ge=1)] | None = None
     ionosphere_scale: NotNegative = 1.0  #: Ionospheric delay as a multiple of the model; 1 leaves no residual error.
     troposphere_scale: NotNegative = 1.0  #: Tropospheric delay as a multiple of the model; 1 leaves no residual error.
@@ -141,8 +141,8 @@ class SkySettings(ScenarioSettings):
 class ReceiverSettings(ScenarioSettings):
     """Receivers: clocks, and noise that is white in time and independent between channels.
 
-    The standard deviation of a code is ``code_sigma_m * 10^(-(min(C/N0, 50) - 45) / 20) /
-    sin(elevation)`` with the C/N0 that is written.
+    The standard deviation of a code is ``code_sigma_m * 10^(-(min(C/N0, 50) - 45) / 20) / sin(elevation)`` with the
+    C/N0 written to the log.
     """
 
     #: Number of signals of a satellite, each with code, phase, Doppler and C/N0.
@@ -161,11 +161,11 @@ class ReceiverSettings(ScenarioSettings):
     #: Increase of C/N0 from the horizon to the zenith, proportional to the sine of the elevation.
     cn0_rise_db: Finite = CN0_RISE_DB
     cn0_satellite_sigma_db: NotNegative = 0.0  #: Standard deviation of constant C/N0 differences between satellites.
-    clocks: Literal["separate", "common"] = "separate"  #: Whether the two receivers share one hardware clock.
+    clocks: Literal["separate", "common"] = "separate"  #: Hardware clock of the two receivers.
     #: Clock bias of the front receiver at the start; separate clocks of other receivers have fixed multiples of this
     #: bias.
     clock_bias_s: float = Field(default=1.2e-4, gt=-0.01, lt=0.01)
-    #: Clock drift of the front receiver [s/s]; other receivers have multiples, as for the bias.
+    #: Clock drift of the front receiver [s/s]; other receivers have the same multiples as for the bias.
     clock_drift: Finite = 2.0e-7
     #: With "millisecond", the receivers step their clocks by whole milliseconds, so that the bias stays within half a
     #: millisecond.
@@ -208,7 +208,7 @@ class Scenario(ScenarioSettings):
     sensors: SensorSettings | None = None  #: On-board sensors in addition to the receivers; None for no sensors.
     stations: tuple[ReferenceStation, ...] = ()  #: Reference stations whose observations are also written.
     sbas: SbasSettings | None = None  #: SBAS whose messages correct the simulated errors; None for no SBAS.
-    #: Further disturbances of the signals, given only from Python; neither in `describe` nor in scenario files.
+    #: Further disturbances of the signals, set only in Python; they are neither in `describe` nor in scenario files.
     multipath: tuple[Disturbances, ...] = Field(default=(), exclude=True)
 
     @field_validator("stations")

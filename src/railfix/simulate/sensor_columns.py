@@ -230,7 +230,7 @@ COLUMNS: Final[dict[str, dict[str, str]]] = {
 
 
 def sensor_tables(simulation: Simulation) -> dict[str, pl.DataFrame]:
-    """Return the tables of the sensors in `Scenario.sensors` by name; empty if it is None.
+    """Return the tables of the simulated sensors by name; empty if `Scenario.sensors` is None.
 
     The tables are ``tachometer`` and ``wheel_slips`` (ground truth), ``inertial``, ``radar``, ``ranging`` and
     ``ranging_units``, ``balises``, ``balise_list`` and ``balise_truth`` (ground truth), with the columns `COLUMNS`;

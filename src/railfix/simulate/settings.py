@@ -294,7 +294,7 @@ class InertialSettings(ScenarioSettings):
     #: Standard deviation of the vibration of each accelerometer axis at 20 m/s and more; below this speed, proportional
     #: to the speed.
     vibration_sigma_mps2: NotNegative = 0.0
-    vibration_sigma_radps: NotNegative = 0.0  #: Standard deviation of the vibration of each gyroscope axis.
+    vibration_sigma_radps: NotNegative = 0.0  #: Vibration sigma of each gyroscope axis at 20 m/s and more.
     #: Mean frequency of the vibration, with a relative bandwidth of 15 %. Frequencies above half of `rate_hz` are
     #: aliased.
     vibration_hz: Positive = 12.0

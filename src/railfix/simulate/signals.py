@@ -34,7 +34,7 @@ from railfix.simulate.scenario import ANTENNAS, Scenario
 
 CN0_STEP_DBHZ: Final = 0.25  #: Resolution of the reported C/N0 [dB-Hz].
 CHUNK_EPOCHS: Final = 2000  #: Number of epochs of a chunk.
-_LOOK_S: Final = 60.0  #: Spacing of the instants at which satellites are tested for being above the cutoff [s].
+_LOOK_S: Final = 60.0  #: Interval at which satellite elevations are compared with the cutoff [s].
 _RATE_S: Final = 0.005  #: Half the time step of the differences from which range rates are computed [s].
 _SIGMA_AT_DBHZ: Final = 45.0  #: C/N0 to which the sigmas of `ReceiverSettings` refer [dB-Hz].
 _BEST_DBHZ: Final = 50.0  #: C/N0 above which the noise is constant [dB-Hz].

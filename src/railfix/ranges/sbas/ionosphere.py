@@ -241,8 +241,7 @@ def _cells(latitude: Floats, longitude: Floats) -> Iterator[Callable[[Indices], 
 def _choose(
     grid: GridTables, time: Datetimes, span: Integers, latitude: Floats, longitude: Floats
 ) -> tuple[Integers, Floats, Floats]:
-    """Return cell corners (M, 4) below 75 deg latitude, -1 if unused, and coordinates x and y in cells (M,).
-    """
+    """Return cell corners (M, 4) below 75 deg latitude, -1 if unused, and coordinates x and y in cells (M,)."""
     point = np.full((len(latitude), 4), _NO_POINT, dtype=np.int64)
     x, y = np.zeros((2, len(latitude)))
     open_ = np.isfinite(latitude) & (np.abs(latitude) < _POLAR_DEG)

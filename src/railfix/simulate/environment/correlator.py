@@ -2,7 +2,7 @@
 
 The code error of the coherent loop is the zero of ``Re(conj(P) (E - L))``, where E, L and P are the sums of all paths
 in the early, late and prompt correlators (Irsigler 2008, 4.1; Braasch in Parkinson & Spilker 1996, vol. I, ch. 14). The
-autocorrelation is a triangle, as for unlimited bandwidth. Where the triangle is straight for all paths, the zero is a
+autocorrelation is a triangle, as for unlimited bandwidth. Where the triangle is linear for all paths, the zero is a
 quotient, so that a few iterations suffice.
 """
 
@@ -34,7 +34,7 @@ class TrackedCode:
 
     code_m: Floats  #: Delay of the code.
     phase_m: Floats  #: Delay of the carrier phase.
-    rate_mps: Floats  #: Rate of change of `phase_m`, at constant amplitudes of the paths.
+    rate_mps: Floats  #: Rate of change of `phase_m`, with constant path amplitudes.
     gain_db: Floats  #: Amplitude of the prompt correlator.
     main: Indices  #: Index of the path to which the loops lock.
 
@@ -104,7 +104,7 @@ def _triangle(x: Singles) -> Singles:
 
 
 def _zero(real: Singles, imaginary: Singles, late: Singles, follow: Singles, spacing: float) -> Singles:
-    """Return the zero of the discriminator [chips] relative to the main path, with amplitude 1 and a `late` of 0."""
+    """Return the zero of the discriminator [chips] relative to the main path, which has amplitude 1 and `late` 0."""
     half = 0.5 * spacing
     error = np.zeros(real.shape[1], dtype=np.float32)
     own = (1.0 - follow) * (real**2 + imaginary**2)
@@ -117,7 +117,7 @@ def _zero(real: Singles, imaginary: Singles, late: Singles, follow: Singles, spa
         # products of different paths oscillate.
         in_phase = follow * (real * carrier + imaginary * quadrature) + own * triangle
         near = away < half
-        # Early minus late of a path at x is -2 x near the zero, then a plateau, which falls to 0 beyond a chip.
+        # For a path at x, early minus late is -2 x near zero, then constant, and falls to 0 beyond one chip.
         far = np.copysign(np.clip(1.0 + half - away, 0.0, spacing), -x)
         push = np.where(near, 2.0 * late, far) * in_phase
         slope = 2.0 * (near * in_phase).sum(axis=0)
@@ -162,7 +162,7 @@ def roughness_loss(roughness_m: Floats, cosine: Floats, wavelength_m: Floats) ->
     """Return the amplitude factor of specular reflection by a rough wall.
 
     The factor is exp(-g^2/2) with g = 4 pi sigma cos(incidence) / lambda (Ament 1953, Proc. IRE 41, 142). Rayleigh's
-    criterion is g of about 1.6.
+    criterion corresponds to g of about 1.6.
     """
     g = 4.0 * np.pi * roughness_m * cosine / wavelength_m
     return np.exp(-0.5 * g * g)

@@ -45,7 +45,7 @@ from railfix.simulate.environment.walls import (
     street_reflections,
 )
 
-_LEAST_WEIGHT: Final = 0.005  #: Weight of a conductor's obstruction below which the obstruction is neglected.
+_LEAST_WEIGHT: Final = 0.005  #: Obstructions with a smaller weight are neglected.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +103,7 @@ class Conductor:
         return amplitude * behind, away * plane * (1.0 - cosine), plane * self.p / away, plane * self.q / away
 
     def _share(self, at_m: Floats, scale: Floats) -> Floats:
-        """Return the fraction by which the conductor obstructs: 1 between its ends, with a transition to 0 beyond."""
+        """Return the obstructing fraction of the conductor: 1 between its ends, falling to 0 beyond its ends."""
         inside = np.minimum(at_m - self.low_m, self.high_m - at_m) * scale
         return 1.0 - edge_amplitude(inside)
 

@@ -70,7 +70,7 @@ class RowSettings(ScenarioSettings):
     length_m: Between = (10.0, 30.0)  #: Length along the line.
     gap_m: Between = (2.0, 10.0)  #: Gap to the next wall.
     share: Share = 1.0  #: Fraction of the plots that have a wall.
-    #: Amplitude reflection coefficient, from 0 to 1; without `AntennaSettings`, including the effect of polarisation.
+    #: Amplitude reflection coefficient, from 0 to 1. Without `AntennaSettings`, it includes the effect of polarisation.
     reflection: Between = (0.2, 0.7)
     roughness_m: Between = (0.0, 0.02)  #: Standard deviation of the surface height.
     yaw_deg: AngleBetween = (-4.0, 4.0)  #: Yaw of the wall relative to the direction of the line.
@@ -200,7 +200,7 @@ class EnvironmentSettings(ScenarioSettings):
     ground_reflection: Share = 0.5  #: Amplitude reflection coefficient of the ballast; 0 for no reflection.
     ground_roughness_m: NotNegative = 0.05  #: Standard deviation of the height of the ballast.
     receiver: CorrelatorSettings = CorrelatorSettings()
-    #: Polarisation of antenna and walls; None for reflections with the amplitude `reflection` for any polarisation.
+    #: Polarisation of antenna and walls. With None, a wall's `reflection` applies to every polarisation.
     antenna: AntennaSettings | None = None
     #: "opposite" adds signals that the nearest rows on both sides reflect in sequence.
     second_reflections: Literal["none", "opposite"] = "none"

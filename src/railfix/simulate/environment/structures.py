@@ -105,18 +105,18 @@ SIDES: Final = ("left", "right")  #: Sides of the line, in the order of the arra
 
 @dataclass(frozen=True, kw_only=True)
 class Strips:
-    """n structures: first those on the left side, then those on the right side. On each side, they are in order of
+    """Structures on the left side, then on the right side, n in total. The structures of a side are in order of
     chainage and do not overlap.
     """
 
     start_m: Floats  #: Chainage of the start, shape (n,).
     end_m: Floats  #: Chainage of the end, shape (n,).
-    border_m: Floats  #: `side * reach_m` plus the chainage from which on the structure is the nearest, shape (n,).
+    border_m: Floats  #: Chainage from which on the structure is the nearest, plus `side * reach_m`, shape (n,).
     reach_m: float  #: Length that is larger than all chainages.
     value: dict[str, Floats]  #: Properties by name, each of shape (n,).
 
     def nearest(self, side: Indices, chainage_m: Floats) -> Indices:
-        """Return the index of the nearest structure on a side (0 left, 1 right); both sides have at least one."""
+        """Return the index of the nearest structure on a side (0 left, 1 right), which has at least one structure."""
         low = np.clip(chainage_m, -0.25 * self.reach_m, 0.5 * self.reach_m)
         return np.searchsorted(self.border_m, side * self.reach_m + low, side="right") - 1
 
@@ -125,8 +125,8 @@ class Strips:
 class Structures:
     """Walls, roofs and sections of a line."""
 
-    #: Rows of vertical walls with `distance_m` (of their middle), `height_m`, `reflection`, `roughness_m` and `slope`
-    #: (tangent of the yaw).
+    #: Rows of vertical walls with `distance_m` (to the middle of the wall), `height_m`, `reflection`, `roughness_m` and
+    #: `slope` (tangent of the yaw).
     walls: tuple[Strips, ...]
     #: Rows of roofs with `inner_m`, `outer_m`, `height_m` and `through` (amplitude factor of signals through the roof).
     roofs: tuple[Strips, ...]
