@@ -127,7 +127,7 @@ def _times_at(target_m: Floats, node_s: Floats, turned_m: Floats, speed_mps: Flo
 
 
 def _miscount(time_s: Floats, settings: TachometerSettings, seed: int) -> Floats:
-    """Return the pulse times with random pulses removed, and with random extra pulses inserted before the next tooth."""
+    """Return the pulse times with random pulses removed, and with random extra pulses inserted between teeth."""
     if not (settings.lost_chance or settings.doubled_chance) or len(time_s) < 2:
         return time_s
     lost, doubled, part = np.random.default_rng([seed, _MISCOUNT]).uniform(size=(3, len(time_s)))
