@@ -200,7 +200,7 @@ def test_only_values_of_the_package_are_read(tmp_path: Path, content: bytes, cap
     path.write_bytes(json.dumps(head).encode() + b"\n" + content)
     loaded = load_state(path, under)
     assert loaded.session is None
-    assert "holds no state" in loaded.outcome
+    assert "contains no state" in loaded.outcome
     assert "evil" not in capfd.readouterr().out
     assert sorted(tmp_path.iterdir()) == [path]
 

@@ -27,7 +27,7 @@ P = ParamSpec("P")
 
 #: First object that the second channel sends, once it is ready for calls.
 _READY: Final = "ready"
-#: Arrays of `AntennaResult` that are compared after each processing stage; the stages are in the order of processing.
+#: Arrays of `AntennaResult` that are compared for each processing stage; the stages are in the order of processing.
 STAGES: Final[dict[str, tuple[str, ...]]] = {
     "corrected ranges": ("corrected_code_m", "sigma_m", "elevation_deg"),
     "screens and exclusion": ("reason",),
@@ -36,11 +36,7 @@ STAGES: Final[dict[str, tuple[str, ...]]] = {
 
 
 def digests(outputs: list[LiveOutput]) -> list[dict[str, str]]:
-    """Return one dictionary per output: the SHA-256 digest of the results of each processing stage, and the encoded
-    message.
-
-    All values are hexadecimal digits.
-    """
+    """Return for each output SHA-256 digests of the results of each stage, and the encoded message, in hexadecimal."""
     return [
         {
             **{

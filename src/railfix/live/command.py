@@ -195,11 +195,10 @@ def _hooks(
     *,
     full: str,
 ) -> tuple[Hooks, Mapping[str, Any]]:
-    """Return the session's hooks, and the states of the receiver streams that were read from the state file.
+    """Return the session's hooks, and the states of the receiver streams as stored in the state file.
 
-    The hooks write the result tables and the state file, show the status line, and check the sensors.
-
-    The mapping of states is empty if there is no state file or the file is not used.
+    The hooks write the result tables and the state file, show the status line, and check the sensors. The states are
+    empty if there is no usable state file.
     """
     observers: list[Callable[[LiveOutput], None]] = [PlaceWatch(log.say).take]
 
@@ -262,7 +261,7 @@ def _close(outlet: Outlet[Any], log: SessionLog) -> None:
 
 
 def _prepare(inputs: LiveInputs, tables: SensorSamples) -> tuple[OpenedLine, EpochProcessor]:
-    """Read the files that are needed at the start; return the line, and an epoch processor that has their data."""
+    """Read the files that are needed at the start; return the line, and an epoch processor with their data."""
     config = inputs.config
     if config.sbas and config.sbas != "stream":
         raise SettingsError(

@@ -1,7 +1,7 @@
 """Log, status line, metrics and checks of a session.
 
-The metrics are served as Prometheus text over HTTP. The checks compare the on-board sensors with positions and speeds
-derived from satellites, and the line with 3-D positions. Contradictions are logged.
+The metrics are served as Prometheus text over HTTP. One check compares the on-board sensors with satellite-derived
+positions and speeds. Another check compares 3-D positions with the line. Contradictions are logged.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ _LINE: Final = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3} ")
 
 
 def check_log_file(path: Path) -> None:
-    """Raise OutputError if an existing file is not the log of a session; the new log would be appended to the file."""
+    """Raise OutputError if an existing file is not a session's log, because the new log is appended to the file."""
     try:
         with path.open("rb") as file:
             begin = file.read(64)
@@ -172,7 +172,7 @@ class Metrics:
     """Counts and processing times of a session."""
 
     messages: Counter[MessageStatus] = field(default_factory=Counter)
-    #: Number of epochs by outcome; this is `LiveEngine.counts`.
+    #: Number of epochs by outcome (`LiveEngine.counts`).
     epochs: Mapping[str, int] = field(default_factory=dict)
     skipped: Counter[str] = field(default_factory=Counter)  #: Number of unused bytes, messages and lines, by reason.
     lost: Counter[str] = field(default_factory=Counter)  #: Number of times that a connection broke, by source.
@@ -329,8 +329,7 @@ class SensorWatch:
     def _hear(self, sensed: Sensed) -> None:
         """Store samples for the check of the sensors.
 
-        After twice `WATCHED_NS`, the sensors are checked if there is a position; the stored samples are dropped in any
-        case.
+        After twice `WATCHED_NS`, the sensors are checked if there is a position, and the stored samples are dropped.
         """
         table = bool(sensed.until == FOREVER)
         if sensed.samples and not self._judged:

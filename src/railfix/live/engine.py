@@ -1,7 +1,7 @@
 """Live positioning of a train: a result for each epoch of one or two antennas, and a message for each period.
 
-`LiveEngine` processes single epochs with the same `EpochProcessor` as for logs. It keeps the state and reads no files.
-Memory is bounded: the number of waiting epochs is limited, and expired records and SBAS messages are dropped.
+`LiveEngine` processes single epochs with the `EpochProcessor` that also processes logs. It keeps the state and reads no
+files. Memory is bounded: the number of waiting epochs is limited, and expired records and SBAS messages are dropped.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ _ORDER_STEP_M = 10.0
 
 @dataclass(frozen=True, kw_only=True)
 class LiveOutput:
-    """Message, and the result of the epoch it reports; the result is None in a period without input."""
+    """Message, and the result of the epoch that it reports; the result is None in a period without input."""
 
     message: TrainMessage
     result: Result | None
     place: TrainPlace | None = None  #: Position reported by the message; None in a period without input.
-    #: Parts to be sent: the message and the rows of the result ("both"), the rows alone if the message is delayed or
-    #: omitted, or a delayed message alone.
+    #: Parts to be sent: the message and the rows of the result ("both"), only the rows if the message is delayed or
+    #: omitted ("rows"), or only a delayed message ("message").
     part: Literal["both", "rows", "message"] = "both"
 
 
@@ -89,7 +89,7 @@ class _FromSatellites:
 
 @dataclass(frozen=True)
 class _Waiting:
-    """Epoch that waits for the other antenna or for sensors; `heard` is the number of satellite items before it."""
+    """Epoch that waits for the other antenna or for sensors; `heard` is the number of earlier satellite items."""
 
     epoch: Observations
     arrived_ns: int
@@ -108,14 +108,14 @@ class LiveEngine:
     ----------
     counts : Counter of str
         Epochs by outcome: "paired", "front alone", "rear alone", "duplicate", "late", "out of order", "tag step",
-        "restart", "no input", "superseded" (processed, but the period's message reports a newer epoch),
-        "skipped, behind the receivers", "dropped, too many waiting", "base station out of order". An epoch for which
-        the tachometer's samples came too late counts as "tachometer silent"; this applies to all sensors.
+        "restart", "no input", "superseded" (processed, but the period's message reports a newer epoch), "skipped,
+        behind the receivers", "dropped, too many waiting", "base station out of order". An epoch for which the samples
+        of a sensor came too late is also counted by sensor, for example as "tachometer silent".
     frame : TrainFrame
         Reference point and ends of the train.
     reports : deque of str
-        Sentences for the log, about replaced missing data, restarts, skipped epochs, the train's direction and the use
-        of a saved state. The caller removes the sentences that it has logged.
+        Sentences for the log, about replacements of missing data, restarts, skipped epochs, the train's direction and
+        the use of a saved state. The caller removes the sentences that it has logged.
     """
 
     def __init__(self, processor: EpochProcessor, settings: LiveSettings, sensors: Sequence[str] = ()) -> None:
@@ -193,7 +193,10 @@ class LiveEngine:
         self._due_ns = now_ns if self._due_ns is None else self._due_ns
 
     def export_state(self, *, reserved: int = 0) -> EngineState:
-        """Return the state for a restarted session; `reserved` is added to the sequence number in case of a crash."""
+        """Return the state for a restarted session.
+
+        `reserved` is added to the sequence number, so that no number is used twice after a crash.
+        """
         sequence = self._sequence + reserved
         if self._saved is not None:  # no epoch has been received yet
             return replace(self._saved, sequence=sequence)
@@ -257,7 +260,7 @@ class LiveEngine:
         self._from_satellites.appendleft(_FromSatellites(heard=0, navigation=known))
 
     def _in_order(self, antenna: str, tag_ns: int) -> bool:
-        """Return whether to process an epoch; `restart_epochs` rising tags before the last tag cause a restart."""
+        """Return whether to process an epoch; `restart_epochs` rising tags older than the last tag cause a restart."""
         last = self._last_tag.get(antenna)
         if last is not None and tag_ns <= last:
             self.counts["duplicate" if tag_ns == last else "out of order"] += 1
@@ -321,7 +324,7 @@ class LiveEngine:
         return self._period_ns if self._silent else self._period_ns + self._period_ns // 2
 
     def _one_a_period(self, outputs: list[LiveOutput], now_ns: int, sent_ns: int) -> list[LiveOutput]:
-        """Return the outputs; the newest has a message if the previous message is at least half a period old.
+        """Return the outputs; the newest output has a message if the previous message is at least half a period old.
 
         Otherwise, the message waits until one period after the previous message, unless a newer message replaces it.
         """

@@ -1,9 +1,9 @@
 """Message forms: functions that encode an output as bytes.
 
-``json`` (one line per message), ``cbor`` (`railfix.io.train_message`; in files and streams, the length in two bytes,
-most significant first, precedes each message), ``nmea`` (GGA, RMC, GST), ``tpv`` (gpsd TPV report), ``etcs`` (position
-report of SUBSET-026, packet 0, one JSON line), ``positions``, ``train`` and ``passings`` (rows of the result tables,
-one JSON line per row).
+``json``: one line per message. ``cbor``: see `railfix.io.train_message`; in files and streams, each message is preceded
+by its length in two bytes, most significant first. ``nmea``: GGA, RMC, GST. ``tpv``: gpsd TPV report. ``etcs``:
+SUBSET-026 position report (packet 0), one JSON line. ``positions``, ``train``, ``passings``: rows of the result tables,
+one JSON line per row.
 """
 
 from __future__ import annotations
@@ -93,10 +93,8 @@ def tpv_bytes(output: LiveOutput) -> bytes:
 def etcs_form(settings: LiveSettings) -> Form:
     """Return the form that encodes SUBSET-026 position reports (packet 0) as JSON lines.
 
-    `settings` has the reference location.
-
-    There is no report if the position of the front end has no bound, or a bound that exceeds the packet's range (327
-    km).
+    `settings` specifies the reference location. There is no report if the front end's position is unknown, or if its
+    bound is unknown or exceeds the packet's range (327 km).
     """
 
     def etcs_bytes(output: LiveOutput) -> bytes:

@@ -20,7 +20,7 @@ from railfix.pipeline.results import AntennaResult, Result
 from railfix.pipeline.sensed_motion import CARRIED
 from railfix.tracking import Kind, TrackStatus
 
-#: K factor of the speed bound, for a two-sided probability of 1e-7; protection levels begin with the same K (P1 2.4).
+#: K factor of the speed bound: an error exceeds K sigma with a probability of 1e-7 (two-sided, as in P1 2.4).
 _SPEED_K = 5.33
 #: Amount by which bounds are increased because chainages are rounded to centimetres [m].
 _ROUNDING_M: Final = 0.01
@@ -65,10 +65,9 @@ class TrainPlace:
 def locate_train(result: Result, frame: TrainFrame) -> TrainPlace:
     """Return the position of the train's reference point, from the antenna with the lowest protection level.
 
-    The position is that of the filter along the track if the filter has one, otherwise that of the single epoch. The
-    bound is the filter's over- and under-reading amount if the filter has a protection level (`tracking.level`).
-    Otherwise, the bound is the single-epoch protection level plus the distance between the positions of filter and
-    single epoch.
+    The filter's along-track position is used if there is one, otherwise the single-epoch position. The bound is the
+    filter's over- and under-reading amount if the filter has a protection level (`tracking.level`). Otherwise, the
+    bound is the single-epoch protection level plus the distance between the positions of filter and single epoch.
     """
     places = [_locate_antenna(name, result, frame) for name in result.antennas]
     return min(places, key=lambda place: (math.isnan(place.chainage_m), place.level_m))
@@ -121,9 +120,9 @@ def create_message(
 ) -> TrainMessage:
     """Return the message of one processed epoch; the sequence number and the time of sending are set later.
 
-    `running` is the direction of the train's leading end. The message has the chainage and bounds of the front end. The
-    bounds are wider if it is unknown which end of the train is ahead. If the position of the front end is unknown, the
-    message has the chainage and bounds of the reference point. A doubtful position has no bounds.
+    `running` is the direction of the train's leading end. The message contains the chainage and bounds of the front
+    end. The bounds are wider if it is unknown which end of the train is ahead. If the position of the front end is
+    unknown, the message contains the chainage and bounds of the reference point. A doubtful position has no bounds.
     """
     antenna, track = result.antennas[place.antenna], result.fusion.get(place.antenna)
     sources = Source(0)
@@ -232,7 +231,7 @@ def _place_and_status(antenna: AntennaResult, track: AlongTrack | None) -> tuple
 
 
 def _has_passed(antenna: AntennaResult) -> bool:
-    """Return whether the last epoch passed every check of the single-epoch solution without an alarm."""
+    """Return whether the last epoch passed every check of the single-epoch solution, and raised no alarm."""
     alarm = antenna.protection is not None and antenna.protection.status[-1] == LevelStatus.ALARM
     return int(antenna.status[-1]) in (Status.OK, Status.JAMMING_SUSPECTED) and not alarm
 

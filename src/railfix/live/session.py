@@ -75,13 +75,13 @@ async def run_session(
     ----------
     sources : mapping of str to str
         Source of each antenna, and of a base station (key `BASE`); see `railfix.live.sources.read_source`. RINEX
-        observation files are replayed as well.
+        observation files are also accepted, and replayed.
     speed : float or None
         Replay speed of recorded files relative to real time. If None, files are replayed as fast as possible, and the
         clock follows the time tags. For exactly one message per epoch, set `LiveSettings.no_input` to "skip".
     sensors : mapping of str to str, optional
         Source of each on-board sensor's stream (`railfix.live.stream`). Tables from files are not included; they must
-        be added to the engine before.
+        be added to the engine beforehand.
     date : datetime64, optional
         A time within half a week of the observations in RTCM 3 streams. It is needed because RTCM 3 has no week
         number. The default is the computer's time, which suits live streams.
@@ -138,8 +138,8 @@ class _Session:
     """Running session: engine, sinks, states of the streams, and the monotonic times at which the state was last saved
     and the status last shown [s].
 
-    `read_to_ns` has the latest time tag [ns] of each source that has not ended, -1 before the first tag of the source.
-    `place` is the last position as a GGA sentence, which is sent to the caster of a virtual base station.
+    `read_to_ns` contains the latest time tag [ns] of each source that has not ended, -1 before the first tag of the
+    source. `place` is the last position as a GGA sentence, which is sent to the caster of a virtual base station.
     """
 
     engine: LiveEngine
@@ -252,7 +252,7 @@ class _Session:
         """Pass the items decoded from one source to the engine; return the time tag [ns] of the last epoch, -1 without
         epochs.
 
-        Without `now_ns`, the time tag of an epoch is its time of arrival.
+        Without `now_ns`, the time tag of an epoch is used as its time of arrival.
         """
         self.streams[name] = received.after
         skipped = self.metrics.skipped
@@ -320,8 +320,8 @@ class _Session:
 
     @property
     def reserved(self) -> int:
-        """Number of sequence numbers that are reserved, so that none is sent twice after a crash: the messages of ten
-        intervals `state_every_s`.
+        """Number of sequence numbers that are reserved, so that none is sent twice after a crash. The reserve covers
+        the messages of ten intervals `state_every_s`.
         """
         settings = self.engine.settings
         return math.ceil(10.0 * settings.state_every_s / settings.period_s)
@@ -382,7 +382,7 @@ class _InTurn:
         self._waiting: dict[str, tuple[np.datetime64, bool] | None] = dict.fromkeys(files)
 
     async def wait(self, name: str, tag: np.datetime64) -> None:
-        """Wait until no other file has an epoch that precedes the epoch `tag` of the file `name`."""
+        """Wait until no other file has an epoch that precedes the epoch with time tag `tag` of the file `name`."""
         self._waiting[name] = own = (tag, name != BASE)
         while any(other is None or other < own for other in self._waiting.values()):
             await asyncio.sleep(0)

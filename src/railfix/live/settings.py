@@ -25,7 +25,7 @@ class LiveSettings(Settings):
     #: samples.
     sensor_wait_s: float = Field(default=0.03, ge=0.0, le=10.0)
     no_input: Literal["send", "skip"] = "send"  #: Whether a message is sent in a period without input.
-    #: Number of consecutive epochs with time tags before an earlier epoch, after which a receiver counts as restarted.
+    #: Number of consecutive epochs with time tags older than the last tag, after which a receiver counts as restarted.
     restart_epochs: int = Field(default=3, ge=1)
     #: Whether a broken connection is opened again; otherwise the session ends when all sources have ended. The first
     #: connection must always succeed.
@@ -33,7 +33,8 @@ class LiveSettings(Settings):
 
     #: Wait before the first attempt to open a broken connection again; the wait doubles with every attempt.
     reconnect_first_s: float = Field(default=1.0, gt=0.0, le=600.0)
-    reconnect_longest_s: float = Field(default=30.0, gt=0.0, le=3600.0)  #: Longest wait before an attempt.
+    #: Longest wait before an attempt to open a broken connection again.
+    reconnect_longest_s: float = Field(default=30.0, gt=0.0, le=3600.0)
     #: A connection on which no byte arrives for this time is considered broken.
     silence_s: float = Field(default=30.0, gt=0.0, le=3600.0)
     #: Interval at which the train's position (GGA) is sent to the base station's caster, as a virtual station requires;
@@ -44,8 +45,8 @@ class LiveSettings(Settings):
     ntrip_certificates: Path | None = None
     #: Number of messages that may wait for a slow target; further messages are dropped and counted.
     waiting: int = Field(default=100, ge=1, le=100_000)
-    #: Delay of an epoch, compared with the shortest delay so far, above which epochs are skipped. This is logged.
-    #: Recorded epochs are never skipped.
+    #: Excess of an epoch's delay over the shortest delay so far, above which epochs are skipped. The skipping is
+    #: logged. Recorded epochs are never skipped.
     behind_s: float = Field(default=5.0, ge=0.5, le=3600.0)
     state_every_s: float = Field(default=5.0, gt=0.0, le=3600.0)  #: Interval at which the state file is written.
     #: Longest time from the last epoch of a state file to the first new epoch. After a longer time, only the
@@ -56,7 +57,8 @@ class LiveSettings(Settings):
     train: int = Field(default=0, ge=0)  #: Identity of the train in messages.
     line: int = Field(default=0, ge=0)  #: Identity of the line in messages.
     #: Direction of the train's leading end at the start: 1 toward rising chainage, -1 toward falling, 0 if unknown. The
-    #: default is taken from the vehicle file. A train that has run 50 m in the other direction has changed ends.
+    #: default is taken from the vehicle file. A train that has run 50 m in the other direction is assumed to have
+    #: changed ends.
     facing: Literal[-1, 0, 1] | None = None
     #: Distance by which the train's front end is ahead of the front antenna; by default computed from the vehicle file.
     front_offset_m: float | None = Field(default=None, ge=0.0)

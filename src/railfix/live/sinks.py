@@ -166,7 +166,7 @@ class UdpTarget:
     socket: socket.socket = field(default_factory=lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
 
     def send(self, output: LiveOutput) -> None:
-        """Send one datagram, unless the form yields no bytes."""
+        """Send one datagram if the form yields bytes."""
         if data := whole_message(self.form, output):
             self.socket.sendto(data, self.address)
 
@@ -209,7 +209,7 @@ class MqttTarget:
             raise OutputError(f"mqtt://{parts.hostname}:{parts.port}: the broker has refused the connection ({answer})")
 
     def send(self, output: LiveOutput) -> None:
-        """Publish one message, unless the form yields no bytes.
+        """Publish one message if the form yields bytes.
 
         Raise OutputError if there is no connection, or the broker is too slow.
         """
@@ -320,7 +320,7 @@ def _open_without_change(path: Path) -> IO[bytes]:
 async def open_sink(
     text: str, settings: LiveSettings | None = None, *, overwrite: str = "refuse", full: str = "drop"
 ) -> Sink:
-    """Open the sink given by a text ``FORM@TARGET``; for `full` see `Outlet`.
+    """Open the sink specified by a text ``FORM@TARGET``; for `full` see `Outlet`.
 
     The content of an existing file remains until the first epoch's message. Raise SettingsError if the text has no
     valid form or target. Raise OutputError if the target cannot be opened, or is an existing file and `overwrite` is

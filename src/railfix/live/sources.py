@@ -37,9 +37,9 @@ _NTRIP = ("ntrip", "ntrips")
 _CONNECT_S = 10.0
 #: Longest wait for a byte in one read of a serial line [s].
 _SERIAL_S = 0.05
-#: Time for a second read after a timeout, for bytes that arrived while the program was busy [s].
+#: Timeout of a second read after a first timeout, for bytes that arrived while the program was busy [s].
 _ONCE_MORE_S = 0.02
-#: While there is no position: longest wait before the next attempt to send a position to a caster [s].
+#: Longest wait before the next attempt to send a position to a caster, while there is no position [s].
 _NO_PLACE_S = 1.0
 #: Longest header of a caster's answer [bytes].
 _HEADER_BYTES = 65_536
@@ -64,7 +64,7 @@ class Lost:
 
 
 def check_source(source: str) -> None:
-    """Raise SettingsError if a source is not given in one of the supported forms."""
+    """Raise SettingsError if a source is not in a supported form."""
     parts = urlsplit(source)
     if parts.scheme in ("tcp", *_NTRIP):
         try:
@@ -96,8 +96,8 @@ async def read_source(
     """Yield the bytes of a source as they arrive, and the events of the connection.
 
     A connection that breaks is opened again, if `LiveSettings.reconnect` is "on". `place` returns the present position
-    as a GGA sentence, which is sent to a caster every `LiveSettings.gga_s` unless it is empty. Raise InputFileError if
-    the source cannot be opened, or if the connection breaks and is not opened again.
+    as a GGA sentence; a sentence that is not empty is sent to a caster every `LiveSettings.gga_s`. Raise InputFileError
+    if the source cannot be opened, or if the connection breaks and is not opened again.
     """
     parts = urlsplit(source)
     if source == "-":
@@ -158,7 +158,7 @@ async def _within(seconds: float, call: Callable[[], Awaitable[Item]]) -> Item:
     """Return the result of a call; raise TimeoutError if the call takes too long.
 
     After a timeout, the call is repeated once with the timeout `_ONCE_MORE_S`, because data may have arrived while this
-    program was busy. (`asyncio.wait_for` may lose a cancellation that arrives at the same time.)
+    program was busy. `asyncio.wait_for` is not used, because it may lose a cancellation.
     """
     with suppress(TimeoutError):
         async with asyncio.timeout(seconds):
@@ -262,7 +262,7 @@ class _Answer:
         self._plain = self.begun = self.ended = False
 
     def request(self, sentence: bytes) -> bytes:
-        """Return the request for the mount point; the request has the GGA sentence `sentence` unless this is empty.
+        """Return the request for the mount point; the request contains the GGA sentence `sentence`, if not empty.
 
         Raise SettingsError if no valid request can be made from the source.
         """
@@ -283,8 +283,8 @@ class _Answer:
             raise SettingsError(f"source {hidden(self._source)!r}: cannot be requested ({error})") from None
 
     def take(self, data: bytes) -> bytes:
-        """Return the content of further bytes of the answer; raise InputFileError if the content is not a receiver's
-        stream.
+        """Return the content decoded from further bytes of the answer; raise InputFileError if the content is not a
+        receiver's stream.
         """
         if self._first is not None:
             self._first += data
@@ -362,7 +362,7 @@ class _Answer:
 def _tls(source: str, certificates: Path | None) -> ssl.SSLContext:
     """Return a TLS context that trusts the certificates of the system and of a PEM file.
 
-    Raise SettingsError if the file cannot be read or has no certificate.
+    Raise SettingsError if the file cannot be read or contains no certificate.
     """
     context = ssl.create_default_context()
     if certificates is not None:

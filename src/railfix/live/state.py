@@ -130,9 +130,9 @@ def load_state(path: Path, under: Mapping[str, Any]) -> Loaded:
     try:
         session = decode(content)
     except StateFormatError as error:
-        return _refuse(path, f"holds no state ({error})")
+        return _refuse(path, f"contains no state ({error})")
     if not isinstance(session, SavedSession):
-        return _refuse(path, "holds no state of a session")
+        return _refuse(path, "contains no session state")
     return Loaded(session=session, outcome=f"state file {path}: belongs to this map, vehicle and settings")
 
 

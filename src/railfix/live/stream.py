@@ -174,7 +174,7 @@ async def next_arrival(
 
 #: Time later than any epoch.
 FOREVER: Final = np.datetime64("2200-01-01", "ns")
-#: Columns that must have a number in every row with values other than the time.
+#: Columns that must contain a number in every row that has more than the time.
 _NEEDED: Final = ("pulse", "range_m")
 #: Columns that contain names.
 _NAMES: Final = ("unit", "balise")
@@ -190,7 +190,7 @@ class Sensed:
     samples: SensorSamples = field(default_factory=SensorSamples)
     #: Time up to which the sensor has reported; NaT before the first row, `FOREVER` for a complete table.
     until: np.datetime64
-    skipped: int = 0  #: Number of lines that are not rows, or have a time before the previous row.
+    skipped: int = 0  #: Number of lines that are not valid rows, or are older than the previous row.
 
     def count_unsurveyed(self, units: GroundUnits | None) -> int:
         """Count the ranges to ground units without a surveyed position; these ranges are not used."""
@@ -281,7 +281,7 @@ class SensorLines:
 #: Largest drift of the computer's clock relative to GPS time [s/s]; the shortest delay in `Lag` grows at this rate.
 DRIFT: Final = 1e-4
 #: Time for which a delay must be constant to count as an offset of the time tags [s]. A delay of processing would not
-#: be constant: it decreases while epochs are skipped, or increases if the computer is too busy even for that.
+#: be constant: it decreases while epochs are skipped, or increases if the computer is too busy even to skip them.
 ADMITTED_S: Final = 2.0
 #: Largest change of a delay that counts as constant [s].
 STEADY_S: Final = 0.2
@@ -306,7 +306,7 @@ class Lag:
     _steady: int = 0
 
     def reset(self) -> None:
-        """Forget the shortest delay after the time tags have jumped."""
+        """Drop the shortest delay after a jump of the time tags."""
         self._shortest_ns, self.skipped = None, 0
 
     def skips(self, tag_ns: int, now_ns: int) -> bool:

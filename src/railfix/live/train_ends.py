@@ -22,7 +22,7 @@ CHANGED_ENDS_M: Final = 50.0
 class Ends(NamedTuple):
     """Positions of a train's ends relative to its reference point along the line [m]; NaN if unknown.
 
-    If the running direction is unknown, each end may be on either side.
+    If the running direction is unknown, each end may be on either side of the reference point.
     """
 
     front_m: float  #: Middle of the possible positions of the front end, positive ahead of the reference point.
@@ -157,7 +157,7 @@ class RunningEnd:
         if not (math.isfinite(reference_m) and math.isfinite(bound_m)):
             return self
         low, high = min(self.low_m, reference_m + bound_m), max(self.high_m, reference_m - bound_m)
-        # The bounds begin anew after a gap, and where the chainage of a closed line starts again.
+        # The bounds are reset after a gap, and where the chainage of a closed line starts again.
         if not abs(reference_m - self.last_m) < CHANGED_ENDS_M:
             low, high = reference_m + bound_m, reference_m - bound_m
         direction = self.direction
@@ -170,9 +170,7 @@ class RunningEnd:
         return replace(self, direction=direction, low_m=low, high_m=high, last_m=reference_m)
 
     def sentence(self, before: RunningEnd) -> str | None:
-        """Return a sentence for the log if the direction differs from that of the earlier state `before`, otherwise
-        None.
-        """
+        """Return a sentence for the log if the direction differs from the earlier state `before`, otherwise None."""
         if self.direction == before.direction:
             return None
         side = "rising" if self.direction > 0 else "falling"
