@@ -1,4 +1,4 @@
-"""Largest standard deviation of a range."""
+"""Screen that rejects ranges with a large assumed standard deviation."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -27,14 +27,14 @@ class LargeSigmaLimits(Settings):
     Attributes
     ----------
     limit_m : float [m]
-        Largest standard deviation used.
+        Largest standard deviation of a range that is used.
     """
 
     limit_m: float = Field(default=10.0, gt=0)
 
 
 class LargeSigmaScreen(ObservationScreen[LargeSigmaLimits]):
-    """Largest standard deviation of a range."""
+    """Screen that rejects ranges with a large assumed standard deviation."""
 
     name = "large_sigma"
     limits = LargeSigmaLimits()
@@ -49,7 +49,7 @@ class LargeSigmaScreen(ObservationScreen[LargeSigmaLimits]):
         return (Verdict(name=self.name, reason=REASON, screened=screened),), None
 
     def pictures(self, tables: RunTables, limits: LargeSigmaLimits) -> Iterator[tuple[str, ScreenPicture]]:
-        """Yield the standard deviations against the limit."""
+        """Yield the picture of the standard deviations and their limit."""
         yield (
             self.name,
             ScreenPicture(
