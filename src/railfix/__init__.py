@@ -1,6 +1,6 @@
 """railfix: satellite train positioning on a 3-D track map.
 
-A train runs on a known line. The antenna of the train therefore lies on a known 3-D curve, and its position is one
+A train runs on a known line. The train's antenna therefore lies on a known 3-D curve, and its position is one
 coordinate along this curve. railfix turns raw receiver logs (RINEX) and a track map into positions along the line, with
 the reason for every rejected observation.
 
@@ -33,15 +33,15 @@ evaluate and report          `evaluate_runs`, `write_report`
 from and to georinex         `observations_from_xarray`, `observations_to_xarray`
 ============================ =========================================================================
 
-docs/example.md computes positions from a log with these names; ``railfix --help`` lists the corresponding commands.
-Every name is imported at its first use, so that ``import railfix`` is fast.
+docs/example.md uses these functions to compute positions from a log; ``railfix --help`` lists the corresponding
+commands. Every name is imported at its first use, so that ``import railfix`` is fast.
 
 Vocabulary
 ----------
 epoch
-    One instant at which a receiver reports. Axis 0 of every array, length T.
+    One instant at which a receiver reports. Epochs are on axis 0 of arrays, with length T.
 channel
-    One satellite on one signal. Axis 1 of every array, length M.
+    One satellite on one signal. Channels are on axis 1 of arrays, with length M.
 ECEF
     Earth-centred Earth-fixed frame, WGS 84 [m]; the last axis of length 3 is x, y, z.
 chainage
@@ -52,7 +52,7 @@ GPS time
     The only internal time scale, stored as ``datetime64[ns]``.
 
 Public names end with the unit of the quantity: ``_m``, ``_deg``, ``_s``, ``_hz``, ``_dbhz``, ``_ecef_m``. Absent values
-are NaN (NaT for times); 0 is a value. In every mask of rejections, True means rejected.
+are NaN (NaT for times); 0 is a value. In every rejection mask, True means rejected.
 """
 
 import lazy_loader

@@ -16,7 +16,7 @@ def raise_exit(number: int, _frame: object) -> None:
 
 
 def main() -> NoReturn:
-    """Run the program; the handlers of signals are installed before the commands are imported, which takes time.
+    """Run the program. Signal handlers are installed first, because the import of the commands takes time.
 
     Signals that are ignored when the program starts, for example under `nohup` or in a shell's background job, stay
     ignored.

@@ -1,4 +1,4 @@
-"""Medians without NaN, and the cheapest path through layers of nodes."""
+"""Medians that ignore NaN, and the cheapest path through layers of nodes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Array types by element, and dataclasses of arrays."""
+"""Array types, and dataclasses of arrays."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def freeze_arrays(instance: DataclassInstance) -> None:
 def freeze_rows(instance: DataclassInstance, of: str, first: str = "time") -> None:
     """Freeze the arrays of a dataclass; raise ValueError if an array differs from the array `first` in length.
 
-    `of` is the name of the rows in the error message.
+    `of` names the rows in the error message.
     """
     rows = len(vars(instance)[first])
     for name, value in vars(instance).items():

@@ -1,8 +1,8 @@
-"""State of each channel across chunks, also across chunks in which the channel is absent.
+"""Keep the state of each channel from chunk to chunk, also through chunks in which the channel is absent.
 
-A chunk has only the channels that were observed in it. A live epoch, for example, may lack a satellite that the
-previous and the next epoch have. A stage with a state per channel therefore processes the channels of both the chunk
-and the state.
+A chunk (consecutive epochs that are processed together) has only the channels that were observed in it. A live epoch,
+for example, may lack a satellite that the previous and the next epoch have. A processing stage that keeps a state per
+channel therefore processes the channels of both the chunk and the state.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Value = TypeVar("Value", bound=np.generic)
 
 @dataclass(frozen=True, kw_only=True)
 class JoinedChannels:
-    """Channels of a chunk, followed by the channels that only the states have; U in total."""
+    """Channels of a chunk, followed by the channels that occur only in states; U in total."""
 
     channel: Strings  #: Names of the channels, shape (U,).
     present: int  #: Number of channels of the chunk, which come first in `channel`.
@@ -29,7 +29,7 @@ class JoinedChannels:
     places: tuple[Indices, ...]
 
     def arrange(self, values: NDArray[Value], fill: Any, state: int = 0) -> NDArray[Value]:
-        """Arrange values of a state, channels on the last axis, for all U channels; `fill` where there is no value."""
+        """Arrange a state's values (channels on the last axis) for all U channels; absent values are `fill`."""
         place = self.places[state]
         known = place >= 0
         out: NDArray[Value] = np.full((*values.shape[:-1], len(place)), fill, dtype=values.dtype)

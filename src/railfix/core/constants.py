@@ -24,7 +24,7 @@ GRAVITY_MPS2: Final = 9.806_65  #: Standard gravity [m/s2] (CGPM 1901).
 
 BDT_MINUS_GPST_S: Final = -14.0  #: BDT - GPST [s]: BeiDou time lags GPS time by a constant (BDS-SIS-ICD-B1I 3.0, 3.3).
 
-#: GPS L1 carrier [Hz], to which the delay of the Klobuchar model refers (IS-GPS-200, 20.3.3.5.2.5).
+#: GPS L1 carrier frequency [Hz]; the delay of the Klobuchar model is for this frequency (IS-GPS-200, 20.3.3.5.2.5).
 FREQUENCY_L1: Final = 1_575.42e6
 
 #: Carrier frequency [Hz] by constellation letter and RINEX 3 band digit (RINEX 3.05, tables 4 to 10).
@@ -48,18 +48,18 @@ CLOCK_GROUP: Final[dict[str, str]] = {"G": "G", "J": "G", "E": "E", "C": "C", "R
 # Constants that kernels and their callers share.
 #: Gradient of the Earth-rotation term of a range with respect to the receiver's position, rounded up (see `geodesy`).
 ROTATION_GRADIENT: Final = 1.1e-5
-#: Number of parts into which the section search divides a stretch of line.
+#: Number of parts into which each step of the section search divides a stretch of line.
 FAN_OUT: Final = 8
 #: Smallest redundancy number of a range whose error can be estimated.
 LEAST_REDUNDANCY: Final = 1e-9
-#: Cosine of the largest angle to the tangent (6 deg) at which the linear model of the protection level holds.
+#: Cosine of the largest angle between the line and its tangent (6 deg) for the linear model of the protection level.
 ALONG: Final = 0.9945
-#: Distance over which the line is first searched for parts that deviate from the tangent [m].
+#: Upper limit of the distance within which the section search approximates the line by its tangent [m].
 CLEAR_M: Final = 200.0
 #: Largest distance from a tangent at which a point counts as lying on the tangent [m].
 ON_TANGENT_M: Final = 1e-3
 
 #: Prior probability of a joint fault of the low satellites on one side of the track. The value is the upper bound with
 #: 95 % confidence from the largest data set: faults in 2 of 30 943 blocks of 30 s, from 70 simulated hours in a city
-#: (docs/level-results.md). The recordings are shorter and support 1e-2 only.
+#: (docs/level-results.md). Real recordings are shorter, and support only an upper bound of 1e-2.
 SUPPORTED_SIDE_PRIOR: Final = 1.3e-5

@@ -46,7 +46,7 @@ def _defaults(kind: Any) -> tuple[str, ...]:
 
 
 def join_epochs(values: Sequence[Value]) -> Value:
-    """Concatenate arrays by rows, also arrays in dataclasses or tuples; other values are those of the first item."""
+    """Concatenate arrays by rows, also arrays in dataclasses or tuples; other values are taken from the first item."""
     first: Any = values[0]
     if len(values) == 1:
         return values[0]
@@ -80,7 +80,7 @@ def _take_epochs(value: Any, rows: slice | Indices) -> Any:
     own, members = value.__dict__, dict[str, Any]()
     if isinstance(value, OnDemand):
         members = {n: item[rows] for n, item in own.items() if item.__class__ is np.ndarray and has_rows[n]}
-        for name in _defaults(cast(Any, value.__class__)):  # a default would hide that a field is not evaluated yet
+        for name in _defaults(cast(Any, value.__class__)):  # with a default, a field would seem evaluated before it is
             members[name] = _take_epochs(own[name], rows)
         members["_later"] = lambda n: _take_epochs(getattr(value, n), rows) if has_rows[n] else getattr(value, n)
         return _make(type(value), members)

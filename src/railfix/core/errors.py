@@ -38,7 +38,7 @@ class RailfixWarning(UserWarning):
 
 
 def warn_of(notes: Iterable[str]) -> None:
-    """Issue each distinct note as a `RailfixWarning`, attributed to the line that called this function's caller."""
+    """Issue each distinct note as a `RailfixWarning` that points to the call of the public function."""
     for note in dict.fromkeys(notes):
         warnings.warn(note, RailfixWarning, stacklevel=3)
 
@@ -66,7 +66,7 @@ class SettingsError(RailfixError):
     exit_code = 4
 
 
-#: Name of the function that returns an object of a type, by the name of the type.
+#: Names of types, and of the functions that return objects of these types.
 _MAKERS: Final = {
     "Track": "read_track",
     "Trajectory": "antenna_trajectory",
@@ -81,7 +81,7 @@ _MAKERS: Final = {
 
 
 def check_type(value: object, expected: type, what: str) -> None:
-    """Raise SettingsError, which names the function to use, if the argument `what` is not of the expected type."""
+    """Raise SettingsError if a value is not of the expected type; `what` names the value in the message."""
     if not isinstance(value, expected):
         maker = f"; {_MAKERS[expected.__name__]} returns one" if expected.__name__ in _MAKERS else ""
         raise SettingsError(f"{what}: expected {expected.__name__}, got {type(value).__name__}{maker}")

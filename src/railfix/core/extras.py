@@ -8,7 +8,7 @@ from typing import Final
 
 from railfix.core.errors import SettingsError
 
-#: Extra of railfix that installs an optional package, by name of the package.
+#: Names of optional packages, and of the extras of railfix that install them.
 _EXTRAS: Final = {
     **dict.fromkeys(("cbor2", "serial", "h11"), "live"),
     "paho": "mqtt",

@@ -40,7 +40,7 @@ Reader = Literal["railfix", "georinex"]  #: Package that reads RINEX observation
 #: Last clause of the message about a malformed line, with the option that skips these lines.
 LENIENT: Final = "--lenient (broken_lines='count') skips and counts what is broken"
 
-#: Name endings of compressed files. The ending before them shows the kind of file, as in ``log.csv.gz``.
+#: Name endings of compressed files. The ending before one of these shows the kind of file, as in ``log.csv.gz``.
 _SUFFIXES: Final = (".gz", ".z", ".bz2", ".xz", ".zst")
 _UTF16: Final = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _HEAD_BYTES: Final = 4096
@@ -84,7 +84,7 @@ class ByteStream(io.BufferedIOBase):
             raise InputFileError(self.path, f"cannot be read ({error.strerror or error})") from error
 
     def read1(self, size: int = -1, /) -> bytes:
-        """Return the same as `read`."""
+        """Equivalent to `read`."""
         return self.read(size)
 
     def close(self) -> None:
@@ -125,7 +125,7 @@ class _HatanakaStream(ByteStream):
 
 
 def path_names(paths: Paths) -> list[str]:
-    """Return one or several paths as a list of strings; raise SettingsError if there is none, or an item is no path."""
+    """Return one or several paths as a list of strings; raise SettingsError if there is no path or a wrong type."""
     names = list(paths) if isinstance(paths, Iterable) and not isinstance(paths, str) else [paths]
     if not names:
         raise SettingsError("no file was given")
@@ -167,7 +167,7 @@ def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -
             raise InputFileError(path, "is empty")
         if content == "text" and head.startswith(_UTF16):
             source = _as_utf8(path, source, held)
-        elif content == "text" and b"\0" in head.rstrip(b"\0"):  # zeros at the end are left by a power failure
+        elif content == "text" and b"\0" in head.rstrip(b"\0"):  # a power failure leaves zeros at the end
             raise InputFileError(path, "is binary; a text file was expected")
         if b"COMPACT RINEX" in head[:80]:
             return _decode_hatanaka(path, source, held)
@@ -234,7 +234,7 @@ def read_text(path: FilePath) -> str:
 
 
 def ending(path: FilePath) -> str:
-    """Return the lower-case ending of a file name (for a zip archive, of the file in it), ignoring compression.
+    """Return the lower-case file name ending, ignoring compression; for a zip archive, the ending of the file in it.
 
     >>> ending("Line.GeoJSON.gz")
     '.geojson'
@@ -256,7 +256,7 @@ def file_sha256(path: FilePath) -> str:
 
 
 def fingerprint(kind: str, path: FilePath, *, name: str | None = None) -> dict[str, Any]:
-    """Return the kind, path (or `name` instead of it), size [byte] and SHA-256 of a file as plain values for JSON."""
+    """Return a file's kind, path (`name` if given), size [byte] and SHA-256 as plain values for JSON."""
     digest = file_sha256(path)
     return {"input": kind, "path": name or str(path), "bytes": Path(path).stat().st_size, "sha256": digest}
 

@@ -71,7 +71,7 @@ def axes_at(ecef_m: ArrayLike) -> Floats:
 
 
 def sigma_along(sigma_enu_m: Floats, ecef_m: Floats, direction: Floats) -> Floats:
-    """Compute the sigma along ECEF unit vectors (T, 3) from uncorrelated sigmas east, north, up at positions (T, 3)."""
+    """Compute the sigma [m] along ECEF unit vectors (T, 3) at positions (T, 3) from independent ENU sigmas (T, 3)."""
     components = np.einsum("tij,tj->ti", axes_at(ecef_m), direction)
     return np.asarray(np.sqrt(np.sum((components * sigma_enu_m) ** 2, axis=1)))
 

@@ -16,8 +16,7 @@ def option(
     panel: str = "Choices",
     **limits: Any,
 ) -> Any:
-    """Return a field of a `Settings` model that is also an option of the command line; without a `default` it is
-    required.
+    """Return a field of a `Settings` model that is also a command-line option; it is required if there is no `default`.
 
     The option is called ``--field-name`` unless `name` is given. A field with a `name`, a default and two allowed words
     (`Literal`) becomes a switch. `panel` is the heading in the help text; `limits` are passed to `pydantic.Field`.

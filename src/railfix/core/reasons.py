@@ -32,11 +32,11 @@ class Reason(IntFlag):
     ELEVATION_MASK = 1 << 7
     #: The satellite is the only usable one of its clock group, so that its range determines only the group's clock.
     ALONE_ON_ITS_CLOCK = 1 << 8
-    #: No group delay of the signal is broadcast, or the satellite is at the horizon.
+    #: No group delay of the signal is broadcast, or the range has no finite sigma (for example at the horizon).
     NO_CORRECTION = 1 << 9
     #: SBAS: the satellite is not in the PRN mask.
     SBAS_NOT_COVERED = 1 << 10
-    #: SBAS: the fast or long-term correction, the degradation, or the record that the correction refers to is missing.
+    #: SBAS: the fast or long-term correction, the degradation, or the navigation record for the correction is missing.
     SBAS_NO_CORRECTION = 1 << 11
     #: SBAS: the corrections have timed out.
     SBAS_TIMED_OUT = 1 << 12
@@ -69,10 +69,10 @@ class Status(IntEnum):
 
     #: A position along the line.
     OK = 0
-    #: A position, but another position on the line fits the ranges equally well, or the ranges do not exclude, at the
-    #: integrity risk, a position beyond the protection level.
+    #: A position, but another position on the line fits the ranges equally well, or the probability of a position
+    #: beyond the protection level exceeds the integrity risk.
     AMBIGUOUS = 1
-    #: A position, but the ranges put it far beyond an end of the map, or too far from the unconstrained position.
+    #: A position, but it is far beyond an end of the map, or too far from the unconstrained position.
     OFF_MAP = 2
     #: No position: fewer usable satellites than `Config.min_satellites`.
     TOO_FEW_SATELLITES = 3
@@ -95,7 +95,7 @@ class Status(IntEnum):
     JAMMING_SUSPECTED = 11
     #: A position, but the signals may be from a spoofer, so that the position error has no bound.
     SPOOFING_SUSPECTED = 12
-    #: A position, but moved to an end of the map: the ranges put it beyond that end by no more than the noise.
+    #: A position that was moved to an end of the map, because it was beyond that end, but within the noise.
     MAP_END = 13
 
     @property

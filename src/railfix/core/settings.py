@@ -97,13 +97,13 @@ class Settings(Checked):
 
 
 def is_number(kind: Any) -> bool:
-    """Return whether the type of a field allows numbers, or numbers and None, but no booleans."""
+    """Return whether a field has a numeric type, or is either numeric or None; booleans do not count as numbers."""
     parts = [get_args(part)[0] if get_origin(part) is Annotated else part for part in (kind, *get_args(kind))]
     return bool not in parts and (int in parts or float in parts)
 
 
 Model = TypeVar("Model", bound=BaseModel)
-INPUTS: Final = "Inputs"  #: Heading of the options that name input files.
+INPUTS: Final = "Inputs"  #: Heading, in the help text, of the options that name input files.
 
 
 def validate(model: type[Model], values: Mapping[str, Any], *, source: str) -> Model:
@@ -136,7 +136,7 @@ def first_fault(model: type[BaseModel], error: ValidationError) -> str:
 
 
 def _in_groups(model: type[BaseModel], name: str) -> list[str]:
-    """Return ``group.name`` if exactly one group of a model has a setting of this name; an empty list otherwise."""
+    """Return ``[group.name]`` if exactly one group of a model has a setting of this name; otherwise an empty list."""
     groups = {key: field.annotation for key, field in model.model_fields.items()}
     found = [
         f"{key}.{name}"
@@ -147,7 +147,7 @@ def _in_groups(model: type[BaseModel], name: str) -> list[str]:
 
 
 def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> set[str]:
-    """Return the names of the settings in the group at a location of a nested model; empty where there is no group."""
+    """Return the names of the settings in the group at a location of a nested model; empty if it is not a group."""
     kind: Any = model
     for part in location:
         if get_origin(kind) is dict:

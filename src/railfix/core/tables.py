@@ -58,7 +58,7 @@ signed: Final = partial(number, sign="+")  #: Format a number with its sign.
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """Table with the names of the rows in the first column; a page offers the table as a CSV file called `name`."""
+    """Table with row names in the first column; an HTML page offers it for download as a CSV file called `name`."""
 
     kind: ClassVar[str] = "table"
     name: str

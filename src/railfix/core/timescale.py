@@ -13,7 +13,7 @@ from railfix.core.arrays import Datetimes, Floats, Integers
 from railfix.core.constants import BDT_MINUS_GPST_S
 
 GPS_EPOCH: Final = np.datetime64("1980-01-06T00:00:00", "ns")  #: Origin of GPS time (IS-GPS-200, 3.3.4).
-#: Origin of BeiDou time, written in BDT (BDS-SIS-ICD-B1I 3.0, 3.3).
+#: Origin of BeiDou time, expressed in BDT (BDS-SIS-ICD-B1I 3.0, 3.3).
 BDT_EPOCH: Final = np.datetime64("2006-01-01T00:00:00", "ns")
 
 SECONDS_PER_WEEK: Final = 604_800
@@ -35,7 +35,7 @@ LEAP_UTC: Final = np.array(
 
 
 def gps_time(value: str | datetime | np.datetime64) -> np.datetime64:
-    """Parse a GPS time; raise ValueError if it is not a time, or has a time zone, which numpy would convert to UTC."""
+    """Parse a GPS time; raise ValueError if the value is not a time or has a time zone."""
     text = str(value).strip().replace(" ", "T")
     if re.search(r":.*([Zz]|[+-][\d:]+)$", text):
         raise ValueError(f"{value} has a time zone; GPS time has none, and UTC is behind GPS time by the leap seconds")

@@ -1,4 +1,4 @@
-"""Effect of each screen and of each source of the filter on accuracy and availability.
+"""Effect of each screen and of each measurement source of the filter on accuracy and availability.
 
 The logs are read once, and every chunk of them is processed with each choice of screens and sources.
 """
@@ -58,10 +58,10 @@ class Effect:
 
     choice: str  #: Name of the choice, such as "all", "none", "only raim", "without raim", "filter without phase".
     screens: tuple[str, ...]  #: Active screens.
-    sources: tuple[str, ...]  #: Sources of the filter along the track; empty for single epochs.
+    sources: tuple[str, ...]  #: Measurement sources of the filter along the track; empty for single-epoch positions.
 
     antenna: str
-    epochs: int  #: Number of epochs with observations, and with a reference position if a reference is given.
+    epochs: int  #: Number of epochs with observations; if a reference is given, also with a reference position.
     rate: float  #: Fraction of the epochs that have coordinates.
     ok_rate: float  #: Fraction of the epochs with status ok; for the filter, with status tracking.
     n_used: float  #: Mean number of satellites used.
@@ -113,7 +113,8 @@ def choices(screens: Sequence[str]) -> dict[str, tuple[str, ...]]:
 
 
 def filter_choices(inputs: RunInputs, sources: Sequence[FilterSource]) -> dict[str, tuple[FilterSource, ...]]:
-    """Return the choices of filter sources by name: all available sources, and all except one (never the codes)."""
+    """Return the choices of filter sources by name: all available sources, and all except one (other than the
+    codes)."""
     absent = [source for source, names in _SENSORS.items() if any(getattr(inputs, name) is None for name in names)]
     there = tuple(source for source in sources if source not in absent)
     return {FILTER: there} | {

@@ -62,7 +62,7 @@ def score(error_m: Floats, observed: Masks) -> Score:
     )
 
 
-#: Numbers of used satellites at which a new class of epochs begins.
+#: Lower edges of the classes of epochs by number of used satellites.
 _SATELLITE_EDGES: Final = (4, 5, 6, 7, 8, 10, 12, 15, 20)
 #: Minimum number of blocks for confidence limits.
 FEWEST_BLOCKS: Final = 5
@@ -145,7 +145,7 @@ def _percentiles(size: Floats, member: Integers, times: Floats, errors: Floats, 
     if not drawn.any():
         return found
     values, rank = np.unique(size, return_inverse=True)
-    # without the tolerance, rounding may make the 95th percentile of 20 errors the twentieth error, not the nineteenth
+    # without the tolerance, rounding could make the 20th of 20 errors the 95th percentile, instead of the 19th
     wanted = (share * errors[drawn] - 1e-9)[:, None]
     low, high, most = 0, len(values) - 1, _NODES
     while True:
@@ -170,7 +170,7 @@ POSITIONS: Final = ("constrained", "constrained_ok", "conventional")
 KEYS: Final = ("run", "configuration", "line", "antenna")
 #: Groupings with confidence limits.
 WITH_LIMITS: Final = ("all", "section", "environment", "speed", "configuration", "line")
-#: Data type of columns of names during grouping. These columns have many rows and few distinct names.
+#: Data type of name columns during grouping; these columns have many rows and few distinct names.
 WORDS: Final = pl.Categorical()
 #: Name of the group of all epochs; also the entry in ``antenna``, ``run`` or ``line`` of rows that combine several
 #: antennas, runs or lines.
@@ -267,7 +267,7 @@ def classify_epochs(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.Data
 
 
 def edges_reached(value: pl.Expr, edges: Sequence[float]) -> pl.Expr:
-    """Return the expression for the number of edges that are not greater than a value."""
+    """Return the expression for the number of edges that a value reaches or exceeds."""
     return pl.sum_horizontal((value >= float(edge)).cast(pl.Int64) for edge in edges)
 
 

@@ -1,4 +1,4 @@
-"""Benchmark: railfix with one configuration, and other programs such as RTKLIB, evaluated on all cases of a folder."""
+"""Evaluate railfix with one configuration, and other programs such as RTKLIB, on all cases in a folder."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from railfix.track.trajectory import Trajectory
 
 #: Name of the row with RTKLIB's single-point positions.
 RTKLIB_SINGLE: Final = "RTKLIB single point"
-#: RTKLIB's program that computes these positions (Debian package rtklib).
+#: RTKLIB's program that computes single-point positions (Debian package rtklib).
 RTKLIB_PROGRAM: Final = "rnx2rtkp"
 #: Largest time difference between a position and the epoch to which it belongs, as a fraction of the median interval of
 #: the epochs.
@@ -56,9 +56,9 @@ _SYSTEMS: Final = {"G": 1, "R": 4, "E": 8, "J": 16, "C": 32}
 def rows_at_epochs(time: Datetimes, found: Datetimes) -> Indices:
     """Return the row of a log for each epoch, shape (T,); -1 for epochs without a row.
 
-    `time` are the epochs, `found` the times of the log. A row belongs to the nearest epoch if the time difference is
-    less than 0.4 of the median interval of the epochs. If several rows belong to an epoch, the nearest is returned.
-    With fewer than two epochs, no epoch has a row.
+    `time` has the times of the epochs, and `found` the times of the log. A row belongs to the nearest epoch if the time
+    difference is less than 0.4 of the median interval of the epochs. If several rows belong to an epoch, the nearest is
+    returned. With fewer than two epochs, no epoch has a row.
     """
     rows = np.full(len(time), -1, dtype=np.intp)
     known = np.flatnonzero(~np.isnat(found))
@@ -105,7 +105,7 @@ def table_of_positions(log: PositionLog, epochs: pl.DataFrame, trajectory: Traje
 
 
 def write_program_run(log: PositionLog, run: Path, out: Path, antenna: Antenna) -> None:
-    """Write another program's positions as the folder of a run; `run` is the folder of railfix's run on the same log.
+    """Write another program's positions in the format of a run to `out`; `run` is railfix's run on the same log.
 
     Raise MismatchError if the run has fewer than two epochs of the antenna, or the log has no position at these epochs.
     """

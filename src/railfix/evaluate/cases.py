@@ -28,7 +28,7 @@ class OtherPositions(Settings):
 
     file: Path
     antenna: Antenna = "front"
-    #: Column names of a CSV file, if they are not the usual names.
+    #: Column names of a CSV file, if they differ from the default names.
     columns: ColumnNames = Field(default_factory=ColumnNames)
 
 
@@ -142,8 +142,8 @@ def read_cases(folder: Path) -> list[Case]:
 def check_not_fitted(config: Config, cases: Sequence[Case]) -> None:
     """Raise MismatchError if a C/N0 curve or an error model was fitted on a held-out case.
 
-    The file of a curve or model records the SHA-256 of the inputs of the fit. These are compared with the SHA-256 of
-    the files of the cases.
+    The file of a curve or model records the SHA-256 of the files that it was fitted on. They are compared with the
+    SHA-256 of the case files.
     """
     files = [path for path in (config.cn0_curve, config.error_model) if path is not None]
     for path in files:

@@ -57,7 +57,7 @@ EPOCH_COLUMNS: Final[dict[str, str]] = {
     "block": "number of the time block within the run, for confidence limits",
 }
 
-#: Expression for rows that come from the filter's table, the only table with a probability of the branch.
+#: Expression that is true for rows of the filter's table, the only table with branch probabilities.
 OF_FILTER: Final = pl.col("branch_probability").is_not_null().any().over("run")
 
 
@@ -76,12 +76,12 @@ class AntennaEpochs:
 
 
 def level_columns(table: pl.DataFrame) -> list[str]:
-    """Return the names of the columns of a table that are protection levels."""
+    """Return the names of a table's protection-level columns."""
     return [name for name in table.columns if "protection_level" in name and name.endswith("_m")]
 
 
 def protection_columns(table: pl.DataFrame) -> list[str]:
-    """Return the names of the columns of a table that are protection levels, then their parts, causes and statuses."""
+    """Return the names of a table's protection-level columns, then the columns of their parts, causes and statuses."""
     levels = level_columns(table)
     endings = [f"_protection_{name}" for name in (*PARTS, *STATED)]
     return levels + [name for name in table.columns if name.endswith(tuple(endings))]
@@ -128,7 +128,7 @@ def distance_travelled(
 ) -> Floats:
     """Return the distance travelled since the first known reference position, shape (T,) [m].
 
-    `step_m` are the distances between successive known positions. Steps at a speed below `options.standing_mps` are not
+    `step_m` has the distances between successive known positions. Steps at a speed below `options.standing_mps` are not
     counted. Over gaps, the distance is interpolated in time. The result is NaN before the first and after the last
     known position.
     """

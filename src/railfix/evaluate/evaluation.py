@@ -36,7 +36,7 @@ BESIDE_THE_LOG: Final = ("truth.csv", "truth.csv.gz", "reference.csv", "referenc
 #: Columns that are read from a table of positions in addition to the columns that every table must have.
 _COLUMNS: Final = cs.by_name("branch_probability", "sources", require_all=False) | cs.contains("protection_")
 _FACTS: Final = ("speed_from", "outside", "step_s")
-#: Offset between the block numbers of successive runs, which makes them unique.
+#: Offset between the block numbers of successive runs, so that each block number is unique.
 _BLOCKS_APART: Final = 10**9
 
 Reference = Path | Mapping[str, AntennaReference] | None
@@ -52,8 +52,8 @@ class RunAndReference:
     reference: Reference = None
     configuration: str | None = None  #: Name of the configuration; if None, a name is made from the settings.
     table: str = POSITIONS_TABLE  #: Name of the table, see `railfix.evaluate.evaluation_inputs.list_position_tables`.
-    #: Folder of another run on the same log; its conventional positions replace those of `run`. For the comparison of
-    #: P1, the other run has only the elevation and C/N0 screens.
+    #: Folder of another run on the same log; its conventional positions replace those of `run`. In the comparison of
+    #: P1, the other run uses only the elevation and C/N0 screens.
     conventional: Path | None = None
 
 
@@ -87,10 +87,10 @@ class Evaluation(NotebookTable):
     intervals: pl.DataFrame  #: Intervals between positions: `INTERVAL_COLUMNS`.
     #: Statistics of the protection levels: `LEVEL_COLUMNS`; None if no run has a protection level.
     levels: pl.DataFrame | None
-    integrity: Mapping[str, Integrity]  #: Comparison of levels with errors, by kind of level.
+    integrity: Mapping[str, Integrity]  #: Comparison of protection levels with errors, by kind of protection level.
     #: Stretches without satellites: `OUTAGE_COLUMNS`; None without a table of the filter along the track.
     outages: pl.DataFrame | None
-    #: Probabilities of the branch: `BRANCH_COLUMNS`; None without a table of the filter along the track.
+    #: Statistics of the branch probabilities: `BRANCH_COLUMNS`; None without a table of the filter along the track.
     branches: pl.DataFrame | None
     options: EvaluationOptions
     inputs: tuple[Mapping[str, Any], ...] = ()  #: Files of all runs, with size and hash.
@@ -191,7 +191,8 @@ def _evaluate(
     files: TrackFiles,
     options: EvaluationOptions,
 ) -> tuple[EvaluatedRun, list[pl.DataFrame], Level | None]:
-    """Evaluate a run; return the run, still unnamed, the epochs of each antenna, and kind and limit of the levels.
+    """Return an evaluated run without a name, the epochs of each antenna, and the kind and limit of its protection
+    levels.
 
     References that are read from files are kept in `read`, so that several runs share them.
     """
@@ -317,7 +318,8 @@ def configurations(settings: Sequence[Mapping[str, Any]], given: Sequence[str]) 
 
 
 def _name_runs(runs: Sequence[EvaluatedRun]) -> list[EvaluatedRun]:
-    """Return the runs with configurations and short distinct names; a name includes a table other than `positions`."""
+    """Return the runs with configurations and short distinct names, which end with the table's name, except
+    `positions`."""
     settings = [dict(run.settings) | {"table": run.table} for run in runs]
     labels = configurations(settings, [run.configuration for run in runs])
     ends = ["" if run.table == POSITIONS_TABLE else f" ({run.table})" for run in runs]
@@ -350,9 +352,9 @@ def _figures(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
 
 
 def _parts(epochs: pl.DataFrame, by: str, as_one: Sequence[str]) -> Iterator[pl.DataFrame]:
-    """Yield the rows with each value in the column `by`, after the columns `as_one` have been set to `ALL`.
+    """Yield, for each value in the column `by`, the rows with this value, and with `ALL` in the columns `as_one`.
 
-    With two antennas, yield the rows with each value again with both antennas combined, where ``antenna`` is `ALL`.
+    If there are two antennas, yield the rows of each value a second time, with `ALL` in the column ``antenna``.
     """
     for keys in (as_one, (*as_one, "antenna"))[: epochs["antenna"].n_unique()]:
         for value in epochs[by].unique(maintain_order=True):

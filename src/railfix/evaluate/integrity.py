@@ -1,8 +1,8 @@
-"""Comparison of protection levels with errors: Stanford counts, availability, continuity, and errors above the level.
+"""Comparison of protection levels with errors: Stanford counts, availability, continuity, errors above the level.
 
-Epochs are counted with two choices of levels. `usable`: a level is used if the status of the position is ok (of the
-filter: tracking or coasting) and the level raises no alarm; any other position is given an infinite level. `all`: every
-level is used, whatever its status.
+Epochs are counted with two choices of protection levels. `usable`: a level is used if the status of the position is ok
+(of the filter: tracking or coasting) and the level raises no alarm; any other position is given an infinite level.
+`all`: every level is used, whatever its status.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from railfix.integrity.stanford import Region, Stanford, stanford
 
 LevelsOf = Literal["usable", "all"]
 
-#: Choices of the levels that are compared with errors; the docstring of this module defines them.
+#: Choices of the protection levels that are compared with errors; the docstring of this module defines them.
 LEVELS_OF: Final[tuple[LevelsOf, ...]] = ("usable", "all")
-#: Columns of the parts of a level, without the prefix "protection_".
+#: Columns of the parts of a protection level, without the prefix "protection_".
 PARTS: Final[tuple[str, ...]] = ("fault_free_m", "one_fault_m", "two_faults_m")
-#: Columns of the cause and the status of a level, without the prefix "protection_".
+#: Columns of the cause and the status of a protection level, without the prefix "protection_".
 STATED: Final[tuple[str, ...]] = ("cause", "status")
 _ALARM: Final = "alarm"
-#: Columns of the table of epochs that a Stanford diagram requires, in addition to the level and its status.
+#: Columns of the table of epochs that a Stanford diagram requires, in addition to the protection level and its status.
 _JUDGED: Final = ("time_gpst", "status", "in_reference", "reference_good", "positioned", "error_m")
 #: Statuses of positions whose protection level bounds the error; a coasting filter is included.
 _BOUNDED: Final = (*PASSED, "coasting")
@@ -72,7 +72,7 @@ STANFORD_COLUMNS: Final[dict[str, str]] = {
     **dict.fromkeys(("windows_60_s", "kept_60_s", "continuity_60_s"), "as for 15 s, for windows of 60 s"),
 }
 
-#: Columns of the list of epochs whose error exceeds the level, with unit and meaning; KIND is the kind of the level.
+#: Columns of the list of epochs whose error exceeds the level, with unit and meaning; KIND is the kind of level.
 BEYOND_COLUMNS: Final[dict[str, str]] = {
     "run": "name of the run",
     "time_gpst": "time tag of the receiver, GPS time",
@@ -103,16 +103,16 @@ class Integrity:
 
 
 def level_name(kind: str) -> str:
-    """Return the name of the column of the table of epochs that has the levels of a kind."""
+    """Return the name of the epochs table's column with the protection levels of a kind."""
     return f"{kind}_protection_level_m"
 
 
 def effective_levels(level_m: Floats, has: Masks, status: Strings, verdict: Strings, *, levels_of: LevelsOf) -> Floats:
-    """Return the levels that are compared with errors, shape (T,) [m].
+    """Return the protection levels that are compared with errors, shape (T,) [m].
 
     A level is infinite if it is missing, or if it is not usable and `levels_of` is "usable". It is NaN at epochs
-    without a position, where the mask `has` is false. `status` is the status of the position, `verdict` the status of
-    the level.
+    without a position, where the mask `has` is false. `status` is the status of the position, and `verdict` is the
+    status of the protection level.
     """
     bound = np.where(np.isnan(level_m), np.inf, level_m)
     if levels_of == "usable":
@@ -134,9 +134,9 @@ def epochs_diagram(
 
 
 def _judge(spanned: pl.DataFrame, kind: str, levels_of: LevelsOf) -> tuple[Floats, Floats]:
-    """Return the errors and the effective levels of epochs within the reference, shape (T,) each [m].
+    """Return the errors and `effective_levels` of epochs within the reference, shape (T,) each [m].
 
-    The error is NaN without a position or a sufficiently accurate reference; for levels see `effective_levels`.
+    The error is NaN without a position or a sufficiently accurate reference.
     """
     has = spanned["positioned"].to_numpy()
     error = np.where(has & spanned["reference_good"].to_numpy(), floats(spanned, "error_m"), np.nan)
@@ -181,7 +181,7 @@ def _sort(
 
 
 def judge_levels(epochs: pl.DataFrame, runs: Mapping[str, Level], options: EvaluationOptions) -> dict[str, Integrity]:
-    """Compare the levels of all runs with the errors at all alarm limits.
+    """Compare the protection levels of all runs with the errors at all alarm limits.
 
     Return the comparison by kind of level; empty if no run has levels.
     """
@@ -242,7 +242,8 @@ def _count(
 
 
 def _pool(rows: list[dict[str, Any]]) -> pl.DataFrame:
-    """Return a table of the counts and of fractions, with sums over antennas and over the runs of a configuration."""
+    """Return the counts and fractions as a table; further rows are sums over antennas and over runs of a
+    configuration."""
     parts = [pl.DataFrame(rows, schema_overrides={"alarm_limit_m": pl.Float64})]
     if parts[0]["antenna"].n_unique() > 1:
         parts.append(parts[0].with_columns(antenna=pl.lit(ALL)))

@@ -104,7 +104,7 @@ def _seconds(duration: pl.Expr) -> pl.Expr:
     return duration.dt.total_nanoseconds() / 1e9
 
 
-#: Minimum duration with which a stretch without satellites is listed in the table [s].
+#: Minimum duration of the stretches without satellites that are listed in the table [s].
 LEAST_S: Final = 2.0
 
 #: Columns of the table of stretches without satellites in addition to its keys, with their unit and meaning.
@@ -130,7 +130,7 @@ _OUTAGE_COLUMNS: Final = (
 def outage_table(epochs: pl.DataFrame) -> pl.DataFrame | None:
     """Return the stretches without satellites (`OUTAGE_COLUMNS`), with the errors of the filter, in order of time.
 
-    Stretches shorter than `LEAST_S` are left out. Return None without a table of the filter.
+    Stretches shorter than `LEAST_S` are omitted. Return None without a table of the filter.
     """
     filtered = epochs.select(*KEYS, *_OUTAGE_COLUMNS).filter(OF_FILTER)
     if not len(filtered):
@@ -209,7 +209,7 @@ def branch_table(epochs: pl.DataFrame) -> pl.DataFrame | None:
     return table.sort(*KEYS, "rank", maintain_order=True).select(*KEYS, *BRANCH_COLUMNS)
 
 
-#: Columns of the table of levels in addition to its keys, with their unit and meaning.
+#: Columns of the table of protection levels in addition to its keys, with their unit and meaning.
 LEVEL_COLUMNS: Final[dict[str, str]] = {
     "level": "column of the level",
     "position": "`constrained` or `constrained_ok`",
@@ -235,7 +235,7 @@ def level_table(epochs: pl.DataFrame, by: list[str]) -> pl.DataFrame | None:
     for level in level_columns(epochs):
         if epochs[level].null_count() == len(epochs):
             continue
-        # runs without this level have no row; runs of the filter's table, for example, have no level of single epochs
+        # runs without this kind of level have no row; the filter's table, for example, has no single-epoch level
         columns = ("run", *by, "status", "observed", "in_reference", "reference_good", "positioned", "error_m", level)
         spanned = epochs.select(*dict.fromkeys(columns)).filter(
             "in_reference", pl.col(level).is_not_null().any().over("run")
@@ -289,10 +289,10 @@ COLUMNS: Final = (
 def compute_service(folders: Sequence[Path], *, stretch_m: float = 100.0, limit_m: float = 20.0) -> pl.DataFrame:
     """Compute the satellite service (`COLUMNS`) by stretches of the line, over all antennas and runs.
 
-    `stretch_m` is the length of a stretch, `limit_m` the alarm limit [m]. The chainage of an epoch is taken from the
-    filter, else from the single-epoch position, else interpolated between the neighbouring epochs with a position. The
-    level is infinite if the filter is neither tracking nor coasting, and null for runs without the filter. Raise
-    MismatchError if the runs are on different maps, or no epoch has a position.
+    `stretch_m` is the length of a stretch, and `limit_m` is the alarm limit [m]. The chainage of an epoch is taken from
+    the filter, else from the single-epoch position, else interpolated between the neighbouring epochs with a position.
+    The protection level is infinite if the filter is neither tracking nor coasting, and null for runs without the
+    filter. Raise MismatchError if the runs are on different maps, or no epoch has a position.
     """
     runs = [read_run(folder) for folder in folders]
     first = runs[0].track_facts

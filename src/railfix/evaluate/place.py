@@ -143,12 +143,12 @@ def straight_distance(arc_m: Floats, reference_ecef_m: Floats, trajectory: Traje
     return distance
 
 
-#: Run and reference count as on the same map if the median difference between their distances in chainage and in space
-#: is at most this [m].
+#: Run and reference are assumed to use the same map if their distance in chainage differs from their straight distance
+#: by at most this (median) [m].
 SAME_MAP_M: Final = 1.0
-#: Largest distance of a position from the trajectory of the run that computed it [m].
+#: A position farther than this from a trajectory was not computed with this trajectory [m].
 SAME_TRAJECTORY_M: Final = 0.01
-#: Largest distance along the line between two points of a vehicle [m].
+#: Assumed largest distance along the line between two points of a vehicle [m].
 _WITHIN_VEHICLE_M: Final = 45.0
 #: An error counts as measured to another pass of the line if the distance along the line to the reference's nearest
 #: point exceeds twice the error by more than this [m].
@@ -317,10 +317,10 @@ def _arc(trajectory: Trajectory, chainage_m: Floats) -> Floats:
 def find_trajectory(
     run: RunFolder, antenna: str, chainage_m: Floats, ecef_m: Floats, files: TrackFiles
 ) -> tuple[Trajectory, tuple[tuple[str, Path], ...], tuple[str, ...]]:
-    """Return the trajectory on which an antenna's positions lie, the files that were read, and notes.
+    """Return the trajectory on which an antenna's positions are located, the files that were read, and notes.
 
-    Raise InputFileError if a file is missing, MismatchError if a position lies off the trajectory by more than
-    `SAME_TRAJECTORY_M`.
+    Raise InputFileError if a file is missing, MismatchError if a position is farther than `SAME_TRAJECTORY_M` from the
+    trajectory.
     """
     tracks = list(files.track) or run.tracks
     vehicles = [files.vehicle] if files.vehicle is not None else run.input_paths("vehicle")

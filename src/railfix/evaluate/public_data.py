@@ -1,4 +1,5 @@
-"""Public recordings in the Python wheel `gnss-benchmark` (MIT) of the package index, unpacked in the user's cache.
+"""Public recordings in the Python wheel `gnss-benchmark` (MIT) of the Python Package Index, unpacked in the user's
+cache.
 
 The wheel contains a drive of 20 minutes through a town and the log of a station 14 km away (Septentrio mosaic-X5, 1 Hz,
 November 2020), and logs of static antennas. The drive is a held-out case: neither settings nor constants were chosen
@@ -103,9 +104,9 @@ def write_drive(recordings: Path, folder: Path) -> str:
     """Write the drive as a held-out case of `railfix benchmark` into a folder; return a text that describes the ground
     truth.
 
-    The ground truth is RTKLIB's kinematic solution with the station, forward and backward, if `rnx2rtkp` is installed,
-    otherwise the publisher's trajectory; the text states the accuracy of this trajectory. The map is made from the
-    ground truth. Raise OutputError if RTKLIB fails.
+    If `rnx2rtkp` is installed, the ground truth is RTKLIB's kinematic solution with the station, forward and backward;
+    otherwise it is the publisher's trajectory. The text states its accuracy. The map is made from the ground truth.
+    Raise OutputError if RTKLIB fails.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for name, source in DRIVE_FILES.items():

@@ -332,8 +332,8 @@ def error_model_from_runs(
 
 
 def _run_errors(source: ModelInputs, number: int, fit: ErrorModelFit) -> _RunErrors:
-    """Compute the range errors of one run by processing it again, chunk by chunk; `number` is the number of the run,
-    which keeps the block numbers of different runs distinct.
+    """Compute the range errors of one run by processing it again, chunk by chunk; the run's `number` makes its block
+    numbers differ from those of other runs.
     """
     past = read_record(source.run)
     past.check_inputs()

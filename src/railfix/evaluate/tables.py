@@ -46,7 +46,7 @@ _AVAILABLE: Final = (
 )
 
 
-#: Names of the protection levels of the filter; all other levels are levels of single epochs.
+#: Names of the filter's protection levels; all other protection levels are for single-epoch positions.
 _LEVEL: Final = pl.col("level").replace(
     {
         "train_protection_level_m": "filter, along the line",
@@ -201,7 +201,7 @@ def error_tables(evaluation: Evaluation) -> list[Table]:
 def group_tables(evaluation: Evaluation) -> list[Table]:
     """Return one table of error statistics per grouping, for positions on the map and conventional positions.
 
-    Groupings in which all epochs are in one trivial group are left out.
+    Groupings in which all epochs are in one trivial group are omitted.
     """
     tables, runs = [], evaluation.runs
     apart = len({run.configuration for run in runs}) == len(runs)
@@ -218,9 +218,10 @@ def group_tables(evaluation: Evaluation) -> list[Table]:
 
 
 def level_tables(evaluation: Evaluation, *, worst: int) -> list[Table]:
-    """Return the tables of protection levels, their Stanford counts, and the epochs whose error exceeds the level most.
+    """Return the tables of protection levels, of Stanford counts, and of epochs whose error exceeds the protection
+    level.
 
-    At most `worst` epochs are listed per kind of level.
+    For each kind of level, only the `worst` epochs with the largest excess are listed.
     """
     tables = []
     if (rows := evaluation.levels) is not None and len(rows):
@@ -278,7 +279,7 @@ def _together(rows: pl.DataFrame) -> pl.DataFrame:
 def _in_order(rows: pl.DataFrame) -> pl.DataFrame:
     """Return the rows of each run and antenna in display order, with formatted confidence limits.
 
-    Rows for common epochs are left out where all kinds of position have the same number of positions.
+    Rows for common epochs are omitted where all kinds of position have the same number of positions.
     """
     order = {name: number for number, name in enumerate(_NAMES)}
     parts: Iterator[pl.DataFrame] = (
@@ -337,7 +338,7 @@ def _stanford(name: str, rows: pl.DataFrame, caption: str, *first: Column) -> Ta
 
 
 def _beyond(found: Integrity, kind: str, worst: int) -> Table:
-    """Return the table of the `worst` epochs whose error exceeds the level most."""
+    """Return the table of the `worst` epochs with the largest excess of the error over the protection level."""
     beyond, usable = found.beyond, int(found.beyond["usable"].sum())
     parts = [pl.col(f"{kind}_{part}").map_elements(partial(number, digits=1), return_dtype=pl.String, skip_nulls=False)
              for part in ("fault_free_m", "one_fault_m", "two_faults_m")]  # fmt: skip
@@ -390,7 +391,7 @@ def write_evaluation(evaluation: Evaluation, folder: OutputFolder) -> dict[str, 
 
 
 def _tables(evaluation: Evaluation) -> dict[str, tuple[pl.DataFrame, Mapping[str, str]]]:
-    """Return all tables except the table of epochs by name, each with the meaning of its columns."""
+    """Return, by name, all tables except the table of epochs, each with the meaning of its columns."""
     tables: dict[str, tuple[pl.DataFrame | None, Mapping[str, str]]] = {
         "figures": (evaluation.figures, FIGURE_COLUMNS),
         "intervals": (evaluation.intervals, INTERVAL_COLUMNS),

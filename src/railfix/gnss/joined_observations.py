@@ -20,10 +20,10 @@ MAX_PROBLEMS: Final = 50  #: Largest number of messages on individual faults; fu
 
 
 def channels_with_data(kinds: Iterable[Floats], loss_of_lock: Bytes) -> Masks:
-    """Return whether each channel has a value in any array of `kinds` (T, M), or a loss-of-lock digit; shape (M,)."""
+    """Return whether a channel has a value in any array of `kinds` (T, M), or a loss-of-lock indicator; shape (M,)."""
     used = np.zeros(loss_of_lock.shape[1], dtype=np.bool_)
     for array in kinds:
-        used |= ~np.isnan(array[:1]).all(axis=0)  # nearly all channels have data in the first epoch
+        used |= ~np.isnan(array[:1]).all(axis=0)  # fast: nearly all channels have data in this epoch
         rest = np.flatnonzero(~used)
         used[rest] = ~np.isnan(array[:, rest]).all(axis=0)
     rest = np.flatnonzero(~used)
@@ -64,7 +64,7 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
 
 
 def stack_parts(parts: Sequence[Observations]) -> Observations:
-    """Stack observations of one or several receivers as `concatenate` does; the parts may be in any order of time."""
+    """Stack observations of one or several receivers as `concatenate` does, but allow any order in time."""
     if not parts:
         raise ValueError("concatenate needs at least one part")
     of_parts = [list(zip(p.satellite.tolist(), p.signal.tolist(), strict=True)) for p in parts]
@@ -117,7 +117,7 @@ def _join_headers(headers: Sequence[ObservationHeader]) -> ObservationHeader:
 
 
 def stack_observations(observations: Sequence[Observations]) -> tuple[Observations, tuple[slice, ...]]:
-    """Stack the epochs of several antennas, with the channels of all; return the stack and the rows of each antenna."""
+    """Stack the epochs of several antennas, with the union of their channels; also return the rows of each antenna."""
     first, *others = observations
     if not others:
         return first, (EVERY,)
@@ -126,7 +126,7 @@ def stack_observations(observations: Sequence[Observations]) -> tuple[Observatio
         (each.satellite.tobytes(), each.signal.tobytes(), *sorted(each.header.glonass_channel.items()))
         for each in observations
     }
-    same = len(keys) == 1  # the same channels in the same order, and the same GLONASS frequencies
+    same = len(keys) == 1  # all antennas have the same channels, in the same order, and GLONASS frequencies
     stacked = join_epochs(observations) if same else stack_parts(observations)
     return stacked, tuple(slice(a, b) for a, b in pairwise(ends))
 

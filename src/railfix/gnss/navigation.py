@@ -57,7 +57,7 @@ class KeplerRecords(_NavigationRecords):
     af0_s: Floats
     af1: Floats
     af2: Floats
-    #: Orbit elements at toe [m^0.5, -, rad, rad/s, rad, rad, rad, rad/s, rad/s]; shape (n,).
+    #: Orbit elements at toe, shape (n,); units in this order: m^0.5, -, rad, rad/s, rad, rad, rad, rad/s, rad/s.
     sqrt_a: Floats
     eccentricity: Floats
     m0: Floats
@@ -126,7 +126,7 @@ class PreciseEphemeris(NotebookTable):
     position_ecef_m: Floats  #: Position; NaN where the file has none (0.000000), shape (E, N, 3).
     clock_s: Floats  #: Clock offset; NaN where the file has none (999999.999999), shape (E, N).
     source: str = ""  #: Names of the files.
-    notes: tuple[str, ...] = ()  #: Notes on omitted records, with reasons.
+    notes: tuple[str, ...] = ()  #: Notes on omitted records, with the reasons.
 
     def __post_init__(self) -> None:
         expected = (len(self.time), len(self.satellite))

@@ -39,7 +39,7 @@ def carrier_frequency_hz(
 
 
 def frequency_by_name_hz(name: Strings, glonass_channel: Floats) -> Floats:
-    """Return the carrier frequency [Hz] of signals ("G1C") and GLONASS channels, shape (..., M); NaN where unknown."""
+    """Return the carrier frequency [Hz] of signals such as "G1C", shape (..., M); NaN where it is unknown."""
     frequency = np.full(glonass_channel.shape, np.nan)
     for text in np.unique(name).tolist():
         letter, band = text[:1], text[1:2]
@@ -87,16 +87,16 @@ class Observations(NotebookTable):
     doppler_hz: Floats  #: Doppler shift, positive when the satellite approaches; shape (T, M).
     cn0_dbhz: Floats  #: Carrier-to-noise density; NaN where only the RINEX 1-9 digit exists; shape (T, M).
     loss_of_lock: Bytes  #: RINEX loss-of-lock indicator of the phase, 0 where blank or absent; shape (T, M).
-    #: Whether an epoch must not be differenced with the previous epoch: after a power failure (epoch flag 1), at a new
-    #: site or with a moving antenna (2, 3), or at the start of another file after a gap; shape (T,).
+    #: Whether an epoch must not be differenced with the previous epoch: after a power failure (epoch flag 1), with a
+    #: moving antenna or at a new site (flags 2 and 3), or at the start of another file after a gap; shape (T,).
     break_before: Masks
-    #: Interference indicated by the receiver: 1 jamming, 2 spoofing, 3 both, 0 if it indicates none; shape (T,).
+    #: Interference indicated by the receiver: 0 none, 1 jamming, 2 spoofing, 3 both; shape (T,).
     receiver_alarm: Bytes = field(default_factory=lambda: np.zeros(0, dtype=np.uint8))
     #: Front-end gain, in the receiver's unit, NaN where unknown; shape (T,).
     front_end_gain: Floats = field(default_factory=lambda: np.zeros(0))
     header: ObservationHeader = field(default_factory=ObservationHeader)
-    #: Messages on faults of the file that were skipped (file, line, fault); at most `MAX_PROBLEMS`, then a message with
-    #: the number of further faults. A slice of epochs has no messages.
+    #: Messages on skipped faults of the file (file, line, fault): at most `MAX_PROBLEMS`, then one with the number of
+    #: further faults. A slice of epochs has no messages.
     problems: tuple[str, ...] = ()
     problem_count: int = 0  #: Number of all faults, with and without a message.
     #: Number of items skipped, by kind: malformed epochs and satellite lines, duplicate epochs, external events,

@@ -26,10 +26,10 @@ _AXES_M: Final[Mapping[str, tuple[tuple[float, float], ...]]] = {
     "C": ((27.5e6, 28.3e6), (41.8e6, 42.5e6)),
     "J": ((41.8e6, 42.5e6),),
 }
-#: Largest plausible eccentricities; that of GPS is from IS-GPS-200 (20.3.3.4.1). E14 and E18 have 0.17, QZSS 0.075.
+#: Largest plausible eccentricities. The GPS limit is from IS-GPS-200 (20.3.3.4.1). E14 and E18 have 0.17, QZSS 0.075.
 _ECCENTRICITIES: Final[Mapping[str, float]] = {"G": 0.05, "E": 0.2, "C": 0.05, "J": 0.12}
-#: Limits of GLONASS radii, and of semi-major axes computed from position and velocity [m]. In the 2,104 records, the
-#: range is 25,416 to 25,602 km.
+#: Limits of GLONASS radii, and of semi-major axes computed from position and velocity [m]. In the 2,104 records, these
+#: values are between 25,416 and 25,602 km.
 _GLONASS_M: Final = (25.3e6, 25.7e6)
 #: Largest difference of the reference times of orbit and clock of a record; they are equal in the 2,104 records.
 LARGEST_TIME_DIFFERENCE_S: Final = 300.0
@@ -74,12 +74,12 @@ def _notes(satellite: Strings, cause: str) -> list[str]:
 
 
 def unrelated_times(records: KeplerRecords) -> Masks:
-    """Return whether toe and toc of each record differ by more than `LARGEST_TIME_DIFFERENCE_S`, shape (n,)."""
+    """Return whether a record's toe and toc differ by more than `LARGEST_TIME_DIFFERENCE_S`, shape (n,)."""
     return np.asarray(np.abs(seconds(records.toe - records.toc)) > LARGEST_TIME_DIFFERENCE_S)
 
 
 def plausible_kepler(records: KeplerRecords) -> Masks:
-    """Return whether semi-major axis and eccentricity of each record fit the constellation, shape (n,)."""
+    """Return whether a record's semi-major axis and eccentricity fit its constellation, shape (n,)."""
     axis, letter = records.sqrt_a**2, records.satellite.astype("<U1")
     fine = np.zeros(len(records), dtype=np.bool_)
     for name, limits in _AXES_M.items():
@@ -89,7 +89,7 @@ def plausible_kepler(records: KeplerRecords) -> Masks:
 
 
 def plausible_glonass(records: GlonassRecords) -> Masks:
-    """Return whether radius and semi-major axis (energy integral) of each record fit GLONASS, shape (n,)."""
+    """Return whether a record's radius and semi-major axis (by the energy integral) fit a GLONASS orbit, shape (n,)."""
     position = records.position_ecef_m
     turning = EARTH_ROTATION_RATE * np.stack([-position[:, 1], position[:, 0], np.zeros(len(position))], axis=1)
     radius = np.linalg.norm(position, axis=1)

@@ -1,6 +1,6 @@
 """Reference trajectory of the antennas, from RTK fixes and from sensors that bridge the gaps (P1 3.1(2), 4.2(2)).
 
-`build_references` takes arrays, and `reference_files` takes files.
+The inputs of `build_references` are arrays, and those of `reference_files` are files.
 """
 
 from railfix.io.reference_log import Acceleration, Pulses, read_acceleration, read_pulses

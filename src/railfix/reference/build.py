@@ -43,7 +43,7 @@ from railfix.track.trajectory import TRACK_AS_PATH, Trajectory
 
 #: Longest interval between two speeds across which the distance travelled counts as known [s].
 LONGEST_STEP_S: Final = 2.5
-#: Variance of the distance travelled across a longer interval [m2].
+#: Variance of the distance travelled in an interval longer than `LONGEST_STEP_S` [m2].
 UNKNOWN_M2: Final = 1e8
 
 
@@ -77,7 +77,7 @@ def _known_speeds(time: Datetimes, speed_mps: Floats, sigma_mps: Floats) -> Spee
 
 
 def combine_speeds(time: Datetimes, sources: Sequence[Speeds]) -> tuple[Floats, Floats]:
-    """Return the sources' mean speed, weighted by inverse variances, and its sigma, shapes (N,); NaN if missing."""
+    """Return the mean speed and its sigma, shapes (N,), NaN without speeds; inverse variances are the weights."""
     weight, total = np.zeros(len(time)), np.zeros(len(time))
     for source in sources:
         at = nearest_rows(time, source.time, within_ns=SAME_INSTANT_NS)
@@ -89,10 +89,10 @@ def combine_speeds(time: Datetimes, sources: Sequence[Speeds]) -> tuple[Floats, 
         return np.where(weight > 0, total / weight, np.nan), np.where(weight > 0, weight**-0.5, np.nan)
 
 
-#: By antenna: known Doppler speeds, and the complete solution.
+#: For each antenna, the speeds at the instants with a Doppler solution, and the solution at all instants.
 SolvedSpeeds = Mapping[str, tuple[Speeds, DopplerSpeed]]
 
-#: Number of rounds of Doppler solution and smoothing; the first assumes a constant speed between fixes.
+#: Number of rounds of Doppler solution and smoothing; the first round assumes a constant speed between fixes.
 _ROUNDS: Final = 3
 _MOVED: Final = 4.0  #: Fixes at least this number of sigmas apart show the direction of travel.
 _TELLING: Final = 2.0  #: Closing errors below this many standard deviations count as noise.
@@ -102,7 +102,7 @@ _TELLING: Final = 2.0  #: Closing errors below this many standard deviations cou
 class ReferenceData:
     """Measurements from which a reference is built."""
 
-    logs: Mapping[str, PositionLog]  #: Positions by antenna, front, rear or both.
+    logs: Mapping[str, PositionLog]  #: Position logs by antenna ("front", "rear").
     trajectories: Mapping[str, Trajectory]  #: Trajectories of the antennas with positions or Dopplers.
     dopplers: Mapping[str, Dopplers] = field(default_factory=dict)  #: Dopplers by antenna; may be empty.
     pulses: Pulses | None = None
@@ -114,8 +114,8 @@ class ReferenceData:
 def build_references(data: ReferenceData, settings: ReferenceSettings | None = None) -> dict[str, Built]:
     """Return the reference positions of every antenna that has a position log.
 
-    NoPositionError: an antenna has fewer than two good fixes. MismatchError: there are two position logs without a
-    distance between the antennas, or the pulses or accelerations have no time in common with the fixes.
+    Raise NoPositionError if an antenna has fewer than two good fixes. Raise MismatchError if there are two position
+    logs without a distance between the antennas, or if pulses or accelerations have no time in common with the fixes.
     """
     settings = settings or ReferenceSettings()
     judged = {name: judge_alone(log, settings) for name, log in data.logs.items()}
@@ -280,7 +280,8 @@ class _ReferenceBuilder:
     def _travel(
         self, time: Datetimes, speeds: SolvedSpeeds, wheel: Wheel | None, fixes: Fixes, settings: ReferenceSettings
     ) -> tuple[Floats, Floats]:
-        """Return the distance travelled up to each time, and its variance, from the wheel or else from Dopplers."""
+        """Return the distance travelled up to each time, and its variance, from the wheel if any, else from
+        Dopplers."""
         joined = self._join(speeds)
         if wheel is not None:
             way = wheel.distance_m(time, self._hint(time, joined, fixes))

@@ -87,7 +87,7 @@ class ReferenceInputs(InputFiles):
         return logs_by_antenna(self.front, self.rear)
 
     def check(self) -> None:
-        """Check the input files before reading; SettingsError or InputFileError if they are incomplete or unusable."""
+        """Raise SettingsError or InputFileError if the input files are incomplete or unusable."""
         if not self.positions:
             raise SettingsError("no positions are given; name a position log with --rtk or --rtk-rear")
         if bool(self.logs) != bool(self.nav):
@@ -164,7 +164,7 @@ _NAMED: Final = 5  #: Largest number of gaps listed in the notes.
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceSummary:
-    """References of a run, notes on them, and the written files."""
+    """Reference trajectories of a run, notes on them, and the written files."""
 
     built: Mapping[str, Built]  #: Reference by antenna.
     notes: tuple[str, ...]
@@ -187,8 +187,8 @@ def reference_files(
     reference.json     versions, hashes of the inputs, settings, counts by reason, gaps
     ================== ======================================================================
 
-    `asked` has the settings that the user specified explicitly; they are recorded. If an error is raised (RailfixError,
-    see `railfix.core.errors`), `out` is left without new files.
+    The settings that the user specified explicitly, `asked`, are recorded in ``reference.json``. If a RailfixError is
+    raised (see `railfix.core.errors`), no new files remain in `out`.
     """
     began = clock.perf_counter()
     settings, options = settings or ReferenceSettings(), options or ReferenceOptions()
@@ -275,7 +275,7 @@ def _read(inputs: ReferenceInputs, line: OpenedLine, options: ReferenceOptions) 
 
 
 def _notes(name: str, part: Built, settings: ReferenceSettings) -> list[str]:
-    """Return notes on gaps that are left out, uncertain instants and unchecked positions."""
+    """Return notes on gaps without a reference, uncertain instants, and positions that were not checked."""
     notes = []
     long = [gap for gap in part.gaps if not gap.bridged]
     if long:

@@ -32,7 +32,7 @@ def _limit(text: str, default: float | None, metavar: str, name: str) -> Any:
     return option(text, default, name=name, metavar=metavar, panel="Limits", gt=0.0, allow_inf_nan=False)
 
 
-_TRAVEL_SHARE: Final = 0.005  #: Fraction of the distance travelled that is added to `ReferenceSettings.travel_m`.
+_TRAVEL_SHARE: Final = 0.005  #: Fraction of the distance travelled that is added to the limit `travel_m`.
 #: Fixes that disagree with their neighbours are rejected for at most twice this time [s]. If the disagreement lasts
 #: longer, the measured distance travelled is assumed to be wrong.
 _TRAVEL_HOLD_S: Final = 10.0
@@ -41,7 +41,7 @@ _FIX_FLOOR_M: Final = 0.01  #: Lower bound of the standard deviation of a fix al
 #: brake by 0.5 to 1 m/s2 for some seconds.
 MOTION_MPS2: Final = 0.5
 MOTION_S: Final = 5.0  #: Correlation time of the train's acceleration [s].
-ACCELERATION_BIAS_MPS2: Final = 0.05  #: Standard deviation of the accelerometer's initial offset.
+ACCELERATION_BIAS_MPS2: Final = 0.05  #: Standard deviation of the accelerometer's initial offset [m/s2].
 
 
 class ReferenceSettings(Settings):
@@ -56,19 +56,19 @@ class ReferenceSettings(Settings):
     )
     #: Whether a fix of one antenna is rejected if the other antenna's log has no fix at that time.
     unpaired: Literal["reject", "keep"] = "reject"
-    #: Largest distance from the antenna's trajectory; about three standard deviations of the map (P1 4.1(3)).
+    #: Largest lateral distance from the antenna's trajectory; about three standard deviations of the map (P1 4.1(3)).
     lateral_m: float = _limit("Largest lateral distance from the antenna's trajectory.", 1.0, "M", "--lateral")
     #: Largest distance above or below the antenna's trajectory.
     height_m: float = _limit("Largest distance above or below the antenna's trajectory.", 2.0, "M", "--height")
-    #: Constant part of the limit of the difference between two distances: from one fix to another along the track, and
-    #: travelled between them (P2 3.3).
+    #: Limit of the difference between the distance of two fixes along the track and the measured distance travelled;
+    #: terms for distance and noise are added to this limit (P2 3.3).
     travel_m: float = _positive(0.10)
     #: Largest speed of a train. Where the line passes a point several times, only the passes that the train can reach
     #: at this speed are considered.
     max_speed_mps: float = _positive(100.0)
     #: Longest gap between good fixes that is bridged.
     max_gap_s: float = _limit("Longest gap between good fixes that is bridged.", 60.0, "S", "--max-gap")
-    #: Largest standard deviation of a bridged instant; less certain instants are left out.
+    #: Largest standard deviation of the position at a bridged instant; less certain positions are omitted.
     max_sigma_m: float = _limit("Largest standard deviation of a bridged instant.", 1.0, "M", "--max-sigma")
     #: Standard deviation of a fix along the track where the log has no standard deviation.
     fix_sigma_m: float = _positive(0.03)
@@ -94,7 +94,7 @@ class ReferenceSettings(Settings):
 
 #: Positions of two antennas belong to one instant if their time tags differ by at most this [ns].
 _PAIR_NS: Final = 5_000_000
-_LOOK_BACK: Final = 60  #: Number of preceding runs of agreeing fixes that are tried as the predecessor of a run.
+_LOOK_BACK: Final = 60  #: Largest number of runs from one run to the next in the chain of runs (`_best_chain`).
 #: Number of standard deviations of a distance difference that are added to the limit `ReferenceSettings.travel_m`.
 _TRAVEL_SIGMAS: Final = 3.0
 _FIX: Final = 1
@@ -126,7 +126,7 @@ class Fixes:
 
     time: Datetimes  #: GPS time, shape (n,).
     ecef_m: Floats  #: Position in ECEF, shape (n, 3).
-    quality: Integers  #: Quality as in `PositionLog`, shape (n,).
+    quality: Integers  #: Solution quality as in `PositionLog`, shape (n,).
     ratio: Floats  #: Ratio of the ambiguity test, NaN where the log has none; shape (n,).
     sigma_enu_m: Floats  #: Standard deviations east, north, up; NaN where the log has none; shape (n, 3).
     rejection: Bits  #: `FixRejection` bits; a row that fails a check is not checked further; shape (n,).
@@ -189,15 +189,15 @@ def _reject(rejection: Bits, mask: Masks, reason: FixRejection) -> None:
 
 
 def judge_pair(fixes: Fixes, other: Fixes, distance_m: float, settings: ReferenceSettings) -> Fixes:
-    """Check the distances between simultaneous positions of the two antennas (P2 3.3: 5 cm)."""
+    """Check the distances between simultaneous positions of the two antennas (limit in P2 3.3: 5 cm)."""
     rows = np.flatnonzero(other.rejection & ~np.int64(_OF_THE_PAIR) == 0)
     rejection, spacing = fixes.rejection.copy(), np.full(len(fixes), np.nan)
     there, place = other.time[rows], other.ecef_m[rows]
     nearest = nearest_rows(there, fixes.time, within_ns=_PAIR_NS)
     paired = (nearest >= 0) & (rejection == 0)
     if len(rows):
-        # At 30 m/s, a millisecond between the two receivers' time tags is 3 cm, so the other position is moved to the
-        # same instant.
+        # At 30 m/s, a difference of 1 ms between time tags causes an error of 3 cm. The other antenna's position is
+        # therefore moved to the time of this row.
         velocity = np.gradient(place, seconds(there - there[0]), axis=0) if len(rows) > 1 else np.zeros_like(place)
         late_s = (fixes.time - there[nearest]).astype(np.int64) / 1e9
         moved = place[nearest] + late_s[:, None] * velocity[nearest]
@@ -210,7 +210,7 @@ def judge_pair(fixes: Fixes, other: Fixes, distance_m: float, settings: Referenc
     return replace(fixes, rejection=rejection, spacing_m=spacing)
 
 
-#: With these reasons for rejection, the other antenna's row is still used to check a distance.
+#: A row that was rejected for these reasons is still used to check positions of the other antenna.
 _OF_THE_PAIR: Final = FixRejection.UNPAIRED | FixRejection.SPACING
 
 
@@ -225,8 +225,8 @@ def match(
 
     A pass is a stretch of the line near a position; a position at a crossing has several passes.
 
-    Returns arc lengths (NaN where no pass is within the limits), offsets to the right and upward, and segments, shapes
-    (F,). Where the arc length is NaN, the offsets and the segment refer to the nearest point of the trajectory.
+    Return arc lengths, offsets to the right, offsets upward, and segments, shapes (F,). The arc length is NaN where no
+    pass is within the limits; the other values then refer to the nearest point of the trajectory.
     """
     count = len(ecef_m)
     nearest, _ = trajectory.nearest(ecef_m)
@@ -236,7 +236,7 @@ def match(
     lateral, height = _beside(offset, trajectory, section)
     passes = find_segments_near(ecef_m, trajectory, float(np.hypot(lateral_m, height_m)))
     beside, above = _beside(passes.offset_m, trajectory, passes.segment)
-    # a position beyond an end of the line has no point on the line
+    # a position beyond an end of the line has no perpendicular foot on the line
     beyond = np.abs(passes.along_m - passes.foot_m) > 0.5
     beyond &= (passes.segment == 0) | (passes.segment == len(trajectory.length_m) - 1)
     within = (np.abs(beside) <= lateral_m) & (np.abs(above) <= height_m) & ~beyond
@@ -251,7 +251,7 @@ def match(
 
 
 def _beside(offset: Floats, trajectory: Trajectory, section: Indices) -> tuple[Floats, Floats]:
-    """Return the components of offsets to the right, and upward (perpendicular to the path and to the right)."""
+    """Return the components of offsets to the right and upward, both perpendicular to the path."""
     right, along = trajectory.across[section], trajectory.tangent[section]
     return np.einsum("fi,fi->f", offset, right), np.einsum("fi,fi->f", offset, np.cross(right, along))
 
@@ -262,7 +262,7 @@ def _chain(position: Indices, arc_m: Floats, lateral_m: Floats, time_s: Floats, 
     if len(found) == len(position):
         return np.arange(len(found))
     reach = max_speed_mps * np.diff(time_s[found]) + _JITTER_M
-    # The cost is the distance travelled, so that a second pass of a crossing costs the additional length.
+    # A step costs the distance travelled, so that a detour to another pass of a crossing costs its additional length.
     ways = (np.abs(after[:, None] - before) for before, after in pairwise(np.split(arc_m, first[1:])))
     steps = (way + np.where(way > limit, _OUT_OF_REACH_M, 0.0) for way, limit in zip(ways, reach, strict=True))
     return np.asarray(first + cheapest_path(np.split(np.abs(lateral_m), first[1:]), steps))
@@ -309,7 +309,7 @@ def judge_travel(
     def agrees(i: Indices, j: Indices) -> Masks:
         spread = np.abs(variance[j] - variance[i]) + fixes.sigma_m[rows[i]] ** 2 + fixes.sigma_m[rows[j]] ** 2
         limit = settings.travel_m + _TRAVEL_SHARE * np.abs(way[j] - way[i]) + _TRAVEL_SIGMAS * np.sqrt(spread)
-        # Where the distance travelled was not measured, nothing is rejected.
+        # Where the distance travelled was not measured, the fixes count as agreeing.
         return np.asarray(~(np.abs(offset[j] - offset[i]) > limit))
 
     keep = _best_chain(agrees, seconds(fixes.time[rows] - fixes.time[rows[0]]), _TRAVEL_HOLD_S)

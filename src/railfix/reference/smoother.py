@@ -30,7 +30,7 @@ _ANY_DISTANCE_M: Final = 1e4
 #: Doppler speeds with a residual above this number of standard deviations are down-weighted (P. J. Huber, 1964).
 _HUBER: Final = 2.0
 _ROUNDS: Final = 4  #: Number of rounds of smoothing and down-weighting.
-_SCALE_DRIFT: Final = 3e-6  #: Drift of the wheel's scale [1 per square root of s].
+_SCALE_DRIFT: Final = 3e-6  #: Drift of the wheel's scale error [1 per square root of s].
 _OFFSET_DRIFT_MPS2: Final = 1e-3  #: Drift of the accelerometer's offset [m/s2 per square root of s].
 _LEAST_READING_M: Final = 1e-3  #: Smallest standard deviation of a wheel reading [m].
 _LEAST_STEP_M: Final = 1e-4  #: Smallest standard deviation of process noise over a step [m].
@@ -291,7 +291,7 @@ def lasting_error_mps(misclosures: Closings, settings: ReferenceSettings) -> flo
 
 
 def slip_m(misclosures: Closings, settings: ReferenceSettings) -> float:
-    """Return the wheel's random error [m per square root of m] from the closing errors; its scale error is excluded.
+    """Estimate the wheel's random error [m per square root of m] from the closing errors, without the scale error.
 
     With fewer than `WINDOWS` windows in motion, the setting is returned.
     """

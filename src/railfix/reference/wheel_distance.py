@@ -29,8 +29,8 @@ class Wheel:
 
     @property
     def reading_sigma_m(self) -> float:
-        """Standard deviation of a reading [m]: for a counter, the value of an error distributed uniformly over a pulse;
-        otherwise 0.
+        """Standard deviation of a reading [m]; for a counter, the error is distributed uniformly over a pulse;
+        otherwise, it is assumed to be 0.
         """
         return self.pulse_m / float(np.sqrt(12.0)) if self.pulses.kind == "count" else 0.0
 
@@ -44,7 +44,7 @@ class Wheel:
         run = self.pulse_m * self.pulses.at(time)
         sign = _direction(run, speed_hint_mps)
         if self.pulses.signed:
-            # A signed counter shows the direction. The hints only determine which of its signs is rising chainage.
+            # A signed counter distinguishes the directions. The hints only determine which sign means rising chainage.
             rising = np.sign(np.nansum(np.diff(run) * sign))
             return run if rising >= 0 else -run
         step = np.diff(run) * sign
@@ -62,7 +62,7 @@ def _cumulate(run: Floats, step: Floats) -> Floats:
 
 
 def _direction(run: Floats, hint: Floats) -> Floats:
-    """Return the direction of each step, shape (N - 1,): 1 or -1; NaN where undetermined; all 1 without hints."""
+    """Return the direction of each step, 1 or -1, shape (N - 1,). It is NaN where undetermined, and 1 without hints."""
     known = np.where(np.abs(hint) > _DIRECTION_MPS, np.sign(hint), np.nan)
     at = np.flatnonzero(np.isfinite(known))
     if not len(at):
@@ -96,7 +96,7 @@ def _turn(step: Floats, before: float, after: float) -> Floats:
 
 
 def estimate_wheel(pulses: Pulses, pulse_m: float | None, time: Datetimes, arc_m: Floats) -> Wheel:
-    """Return the wheel with the given distance per pulse, or with the median of estimates from good fixes.
+    """Return a `Wheel` with the given distance per pulse, or with the median of the estimates from good fixes.
 
     Raise MismatchError if there are too few fixes in motion, or if the speed between two rows exceeds 150 m/s.
     """

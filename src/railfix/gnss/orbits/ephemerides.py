@@ -43,7 +43,7 @@ ROTATION: Final[Mapping[str, float]] = {
 
 @dataclass(frozen=True)
 class Orbits(RowArrays):
-    """Orbit elements and time-independent quantities, shape (n,); further fields are as in `KeplerRecords`."""
+    """Orbit elements and derived quantities, shape (n,); fields without a comment are as in `KeplerRecords`."""
 
     a: Floats  #: Semi-major axis [m].
     motion: Floats  #: Corrected mean motion [rad/s].
@@ -59,7 +59,7 @@ class Orbits(RowArrays):
     i_dot: Floats
     node: Floats  #: Longitude of the ascending node at toe [rad].
     node_rate: Floats  #: Rate of `node` [rad/s].
-    #: BeiDou GEO: rotation rate of the Earth-fixed frame relative to the tilted frame at toe; otherwise 0 [rad/s].
+    #: For BeiDou GEO, rotation rate of the Earth-fixed frame relative to the tilted frame at toe [rad/s]; otherwise 0.
     tilted_rate: Floats
 
     cuc: Floats
@@ -74,7 +74,7 @@ class Orbits(RowArrays):
 
     @classmethod
     def from_records(cls, records: KeplerRecords) -> Orbits:
-        """Compute the orbits of all records, in their order."""
+        """Compute the orbits of all records, in the order of the records."""
         system = records.satellite.astype("<U1").tolist()
         gm = np.array([GM.get(s, np.nan) for s in system], dtype=np.float64)
         rotation = np.array([ROTATION.get(s, np.nan) for s in system], dtype=np.float64)
@@ -106,7 +106,7 @@ def is_beidou_geo(satellite: str) -> bool:
 
 
 def eccentric_anomaly(mean_anomaly: Floats, eccentricity: Floats) -> tuple[Floats, Floats, Floats]:
-    """Solve M = E - e sin E in three Newton steps (to the last digit for e < 0.2); return E, sin E and cos E."""
+    """Solve M = E - e sin E in three Newton steps; return E, sin E and cos E, exact to the last digit for e < 0.2."""
     anomaly = mean_anomaly
     sine, cosine = np.sin(anomaly), np.cos(anomaly)
     for _ in range(2):
@@ -119,7 +119,7 @@ def eccentric_anomaly(mean_anomaly: Floats, eccentricity: Floats) -> tuple[Float
 
 
 def _rotate(sine: Floats, cosine: Floats, angle: Floats) -> tuple[Floats, Floats]:
-    """Compute the sine and cosine after adding a small angle; exact to rounding for an angle below 1e-3 rad."""
+    """Add a small angle to an angle given by sine and cosine; exact to rounding for a small angle below 1e-3 rad."""
     square = angle * angle
     small_sine = angle * (1.0 - square / 6.0)
     small_cosine = 1.0 - square * (0.5 - square / 24.0)
@@ -238,7 +238,7 @@ class GlonassStates:
 
     @classmethod
     def from_records(cls, records: GlonassRecords, reach_s: float) -> GlonassStates:
-        """Integrate all records over `reach_s` in both directions and one step beyond."""
+        """Integrate all records forward and backward over `reach_s` and one more step."""
         steps = int(np.ceil(reach_s / STEP_S)) + 1
         luni_solar = np.ascontiguousarray(records.acceleration_ecef_mps2.T)
         position = np.empty((3, len(records), 2 * steps + 1))
@@ -274,7 +274,7 @@ class GlonassStates:
 #: and within a micrometre for other satellites. In the first and last interval of a file, the error is up to 0.7 m for
 #: these two satellites, and 0.05 mm for others.
 POINTS: Final = 13
-#: An interval longer than this multiple of the usual interval is a gap, within which there are no states.
+#: An interval longer than this multiple of the usual interval is a gap; no states are computed in a gap.
 _GAP: Final = 1.5
 _STATES: Final = 4096  #: Number of states computed at once, so that the arrays stay in the cache.
 
@@ -343,7 +343,7 @@ def _state(
 
 
 def _sum(terms: Floats) -> Floats:
-    """Return the sum over the nodes (axis 1) in a fixed order, for reproducible rounding."""
+    """Return the sum over the nodes (axis 1), with the terms added in a fixed order, for reproducible rounding."""
     total = terms[:, 0].copy()
     for i in range(1, terms.shape[1]):
         total += terms[:, i]

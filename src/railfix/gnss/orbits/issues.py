@@ -1,4 +1,4 @@
-"""Select navigation records by satellite and issue of data, by which SBAS corrections refer to a record."""
+"""Select navigation records by satellite and by issue of data, with which SBAS corrections identify a record."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class _Issues:
 
     Each record is used from the time half-way between the previous record's toe and its own toe.
 
-    Of two records with the same toe, F/NAV takes precedence over I/NAV.
+    Of two records with the same toe, the F/NAV record takes precedence over the I/NAV record.
     """
 
     def __init__(self, kepler: KeplerRecords) -> None:
@@ -54,8 +54,7 @@ def _index_issues(navigation: Navigation) -> _Issues:
 
 
 def issue_records(navigation: Navigation, satellite: Strings, time: Datetimes, issue: Integers) -> Integers:
-    """Return the row of `navigation.kepler` with a given issue and the nearest toe, shape (T, M); -1 if it is not
-    valid.
+    """Return the row of `navigation.kepler` with a given issue and the nearest toe, shape (T, M); -1 if none is valid.
 
     The records are selected for the times of reception `time`, shape (T,), not for the times of transmission.
     """

@@ -30,9 +30,9 @@ from railfix.gnss.orbits.ephemerides import GlonassStates, Orbits
 #: min) do not broadcast a validity; their limits are taken from RTKLIB 2.4.3 (MAXDTOE_CMP, MAXDTOE_GLO of rtklib.h).
 VALIDITY_S: Final[Mapping[str, float]] = {"G": 7200.0, "J": 7200.0, "E": 14_400.0, "C": 21_600.0, "R": 1800.0}
 
-#: A transmission time counts as wrong if it is outside the record's validity by more than this [s].
+#: A transmission time outside the record's validity by more than this counts as wrong [s].
 _EARLY_S: Final = 3600.0
-#: Time span that a lookup key can hold [ms]: 34 years, so that records of another year are kept apart.
+#: Time span that a lookup key can hold [ms]: 34 years. Records of different years must have different keys.
 _SPAN: Final = np.int64(2**40)
 _MILLISECOND: Final = np.timedelta64(1, "ms")
 
@@ -43,11 +43,11 @@ class Lookup:
 
     number: Mapping[str, int]  #: Lookup number by satellite, or by satellite and message ("E01 INAV").
     first: Integers  #: First record of each satellite in both lists, shape (satellites,).
-    #: Satellite and time of availability [ms since `origin`] as one ascending number, and the row of the record table;
-    #: shape (n,).
+    #: Keys that combine satellite and time of availability [ms since `origin`], ascending, and the row of each key in
+    #: the record table; shape (n,).
     sent_key: Integers
     sent_record: Integers
-    #: The same with the start of use, half-way between the reference times of the previous and this record; (n,).
+    #: Keys and rows with the start of use instead: half-way from the previous record's toe to the record's toe; (n,).
     toe_key: Integers
     toe_record: Integers
 
@@ -57,7 +57,7 @@ class Lookup:
     available: Datetimes
 
     def find(self, number: Integers, time: Datetimes, limit: NDArray[np.timedelta64]) -> tuple[Integers, Masks, Masks]:
-        """Return, for each satellite and time, a record, its validity, and whether it was sent later; shapes (M, T).
+        """Return each satellite's record at each time, whether it is valid, and whether it was sent later; (M, T).
 
         The record is a row of the record table; -1 for a satellite without records. The record is valid if its toe
         differs from the epoch by at most `limit`, which has one value per row of the table.
@@ -136,16 +136,16 @@ _ISC: Final[Mapping[str, list[int]]] = {
     "1S": [4], "1L": [5], "1X": [4, 5],
 }  # fmt: skip
 P_CODES: Final = ("2P", "2W", "2Y", "2D", "2N", "2M")  #: Signals of the P code, to which TGD refers.
-#: Bits of the health word of CNAV by band.
+#: Bit of the CNAV health word by band.
 _CNAV_HEALTH: Final[Mapping[str, int]] = {"1": 0b100, "2": 0b010, "5": 0b001}
-_ANY: Final = -1  #: All bits.
+_ANY: Final = -1  #: Mask of all bits.
 
 
 def unhealthy(records: KeplerRecords, signal: str) -> Masks:
     """Return whether each record flags a signal as unhealthy, shape (n,).
 
     A signal is flagged by any of the six health bits in GPS LNAV, by the bits of this signal for QZSS and Galileo, by
-    the bit of the band in CNAV, and by SatH1 or HS for BeiDou. A signal is also unhealthy if a Galileo record predicts
+    the bit of its band in CNAV, and by SatH1 or HS for BeiDou. A signal is also unhealthy if a Galileo record predicts
     no accuracy (SISA "NAPA", written as -1, marginal by OS SDD 1.3, 2.3.1.4), or the accuracy of any record is above
     `LARGEST_ACCURACY_M`.
     """
@@ -258,7 +258,7 @@ class ChannelRecords:
     #: Indices of the channels with Keplerian records, shape (K,), and of the GLONASS channels, shape (R,).
     kepler: Indices
     glonass: Indices
-    #: Lookup numbers of the message with the signal's clock and delay, and of the alternative; -1 if absent; (K,).
+    #: Lookup numbers of the message with the signal's clock and delay, and of another message; -1 if absent; (K,).
     preferred: Integers
     other: Integers
 
@@ -266,7 +266,7 @@ class ChannelRecords:
     signal: Integers  #: Row of each channel in `group_delay_s` and `unhealthy`, shape (K,).
     group_delay_s: Floats  #: Group delay by signal and record, shape (signals, records).
     unhealthy: Masks  #: Whether a record flags a signal as unhealthy, shape (signals, records).
-    glonass_number: Integers  #: Lookup number of GLONASS channels, -1 for none; shape (R,).
+    glonass_number: Integers  #: Lookup number of GLONASS channels, -1 without records; shape (R,).
 
 
 class PreparedRecords:
@@ -329,7 +329,7 @@ def _rows(of_signal: Callable[[str], NDArray[np.generic]], codes: list[str], rec
     return np.array([of_signal(code) for code in codes], dtype=np.float64).reshape(len(codes), records)
 
 
-#: Message with the group delay of each constellation's signals whose delay is not in LNAV, D1, D2, I/NAV or F/NAV.
+#: For signals whose group delay is not in LNAV, D1, D2, I/NAV or F/NAV: the message that contains it, by constellation.
 _MESSAGE_OF: Final = {
     **dict.fromkeys(("G2S", "G2L", "G2X", "G5I", "G5Q", "G5X", "J2S", "J2L", "J2X", "J5I", "J5Q", "J5X"), "CNAV"),
     **dict.fromkeys(("G1S", "G1L", "G1X", "J1S", "J1L", "J1X"), "CNV2"),
