@@ -2,9 +2,9 @@
 Fewer constellations
 ====================
 
-A position along the line requires two satellites fewer than a 3-D position. This example computes positions of the
-demonstration with four choices of constellations. It compares the rates, errors and protection levels of single epochs
-and of the filter.
+A position along the line has two unknowns fewer than a 3-D position, and therefore requires fewer satellites. This
+example computes positions of the demonstration with four choices of constellations. It compares the rates, errors and
+protection levels of single epochs and of the filter.
 """
 
 import polars as pl
@@ -38,8 +38,8 @@ choices = {"G": ("G",), "E": ("E",), "G, J": ("G", "J"), "G, J, E": ("G", "J", "
 errors = {name: errors_with(systems) for name, systems in choices.items()}
 
 # %%
-# GPS alone (G), Galileo alone (E), GPS with QZSS (J), and all three. The filter also has a position in the tunnel,
-# and where single epochs have too few satellites.
+# The choices are GPS alone (G), Galileo alone (E), GPS with QZSS (J), and all three. The filter also has a position in
+# the tunnel, and where single epochs have too few satellites.
 
 pl.concat(
     table.select(

@@ -46,8 +46,8 @@ difference_m = np.abs(np.array(chainage_m) - whole.fusion["front"].chainage_m)
 print(f"largest difference {np.nanmax(difference_m):.1e} m")
 
 # %%
-# The chart shows chainage and protection level as computed at each epoch. The level decreases with the number of
-# measurements.
+# The chart shows chainage and protection level as computed at each epoch. The protection level decreases as the number
+# of measurements increases.
 
 figure, (upper, lower) = pyplot.subplots(2, sharex=True, layout="constrained")
 seconds = (log.time[:600] - log.time[0]) / np.timedelta64(1, "s")

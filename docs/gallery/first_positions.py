@@ -2,8 +2,8 @@
 First positions
 ===============
 
-A receiver log, navigation records and a track map give positions along the line. The files are those of the
-demonstration that comes with railfix: a simulated train with two antennas runs through a town and a tunnel.
+Positions along the line are computed from a receiver log, navigation records and a track map. The files are those of
+the demonstration that comes with railfix: a simulated train with two antennas runs through a town and a tunnel.
 """
 
 # %%
@@ -23,8 +23,8 @@ vehicle = railfix.read_vehicle(files["vehicle"])
 observations["front"]
 
 # %%
-# The log is a set of arrays. Axis 0 is time and axis 1 the channel: one satellite on one signal. The map and the
-# vehicle file give the curve in space on which each antenna moves.
+# The log is a set of arrays. Axis 0 is time, and axis 1 is the channel (one satellite on one signal). The map and the
+# vehicle file determine the curve in space on which each antenna moves.
 
 trajectories = {name: railfix.antenna_trajectory(track, vehicle, name) for name in observations}
 track, navigation

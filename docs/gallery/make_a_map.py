@@ -3,8 +3,8 @@ Make a track map from positions
 ===============================
 
 One run with accurate positions (RTK) is enough for a map. Here the ground truth of the demonstration, with noise of
-two centimetres, replaces RTK positions. ``railfix map from-positions`` and ``railfix map check`` do the same
-for files.
+two centimetres, replaces RTK positions. The commands ``railfix map from-positions`` and ``railfix map check`` do the
+same with files.
 """
 
 # %%
@@ -67,4 +67,4 @@ error_m = np.abs(result.antennas["front"].arc_m - true_arc_m)[passed]
 print(f"{len(error_m)} epochs ok; error along the line: median {np.median(error_m):.2f} m, max {np.max(error_m):.2f} m")
 
 # %%
-# The points of a map are chosen so that the chords between them stay within 0.3 m of the curve.
+# The points of a map are chosen so that the chords between them stay within 0.3 m of the path.

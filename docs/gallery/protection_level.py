@@ -3,7 +3,7 @@ Protection level with a faulty satellite
 ========================================
 
 A protection level bounds the error of a position at a stated risk, including satellite faults. This example
-compares the levels of the demonstration with its errors, with and without a fault.
+compares the protection levels of the demonstration with its errors, with and without a fault.
 """
 
 # %%
@@ -79,7 +79,7 @@ table.insert_column(0, pl.Series("fault", ["none", "40 m"]))
 # Assumed probabilities
 # ---------------------
 #
-# The levels of this run are *indicative*: the probabilities of faults are assumed, not measured on this line.
+# The protection levels of this run are *indicative*: fault probabilities are assumed, not measured on this line.
 
 railfix.Config().risk
 

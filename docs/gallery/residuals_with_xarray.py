@@ -34,7 +34,7 @@ table = rms_m.to_series().set_axis(data.satellite.values + " " + data.signal.val
 table.sort_values(ascending=False).head(8).round(2)
 
 # %%
-# The residuals of the satellite with the largest spread, over chainage on the outward run:
+# This chart shows the residuals of the satellite with the largest spread over chainage, on the outward run:
 
 channel = int(np.nanargmax(rms_m.values))
 outward = slice(0, int(np.nanargmax(data.filter_chainage_m.values)))

@@ -67,7 +67,7 @@ int(raim.excluded.any(axis=1).sum()), float(np.nanmedian(level.level_m))
 # ----------------------------
 #
 # The stages are compared with the pipeline for two and for four constellations, and for a navigation file without
-# ionospheric coefficients. Without coefficients, typical coefficients are used, and 2 m is added to the standard
+# ionospheric coefficients. In the last case, typical coefficients are used, and 2 m is added to the standard
 # deviation of the vertical delay.
 
 # If the environment variable ``RECORDING`` names a folder with ``log.obs``, ``log.nav`` and the antenna's path as

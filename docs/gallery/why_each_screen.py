@@ -47,8 +47,8 @@ plots.plot_screen_over_time(screens["doppler"].picture, screens["doppler"].time)
 
 
 # %%
-# **Antenna pair.** The pseudoranges of two antennas on one roof differ by an amount that follows from their spacing.
-# A different value indicates multipath at one of the antennas.
+# **Antenna pair.** The difference between the pseudoranges of two antennas on one roof follows from the antennas'
+# spacing. A different value indicates multipath at one of the antennas.
 
 plots.plot_screen_over_chainage(screens["antenna_pair"].picture, screens["antenna_pair"].chainage_m)
 
@@ -58,8 +58,8 @@ plots.plot_screen_over_chainage(screens["antenna_pair"].picture, screens["antenn
 # deviation of a suspected observation by the measured error. The geometry therefore does not become weaker where few
 # satellites are left.
 #
-# **RAIM.** Up to two satellites are excluded where the sum of squared residuals exceeds a threshold, which follows from
-# the distribution of this sum without faults.
+# **RAIM.** Up to two satellites are excluded where the sum of squared residuals exceeds a threshold. The threshold
+# follows from the distribution of this sum in the absence of faults.
 
 plots.plot_screen_over_chainage(screens["raim"].picture, screens["raim"].chainage_m)
 

@@ -73,7 +73,7 @@ def campaign(
         reference = "logs/{train}/{day}/truth.csv"
 
     `track`, `vehicle` and the sensors' tables (`tachometer`, `inertial`, `radar`) may have fields too. The options of
-    `railfix run` stand in tables; for a KML map and logs with broken lines, for example:
+    `railfix run` are written in tables; for a KML map and logs with broken lines, for example:
 
         [options.track]
         height_datum = "orthometric"
@@ -156,7 +156,7 @@ def open_executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executo
     if scheduler is None:
         with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_prepare_worker) as pool:
             try:
-                signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)  # workers inherit the mask until their initializer
+                signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)  # workers inherit the mask until initialised
                 for _ in range(workers):
                     pool.submit(int)
                 signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING)
@@ -211,7 +211,7 @@ def benchmark(
     `positions` are logs of positions that other programs have computed (RTKLIB, NMEA, CSV). These positions are moved
     to the nearest point of the line and evaluated with the same code. If `rnx2rtkp` is installed, the single-point
     positions of RTKLIB are computed and evaluated in this way, too. `scenario` describes the recording as EN 16803-2
-    requires for record and replay. `options` has options of `railfix run`, and `evaluation` options of `railfix
+    requires for record and replay. `options` has options of `railfix run`, and `evaluation` has options of `railfix
     evaluate`. A case with `held_out` is reserved for the benchmark: settings derived from its files are rejected.
 
     `benchmark.csv`, `benchmark.json`, `benchmark.md` and the folders of the runs are written into DIR. A run is not
@@ -269,8 +269,8 @@ def ablate(
     ok, the number of satellites used, and the median standard deviation along the line. With `--truth`, the table also
     shows errors along the line for three groups: all epochs with coordinates, epochs with status ok, and epochs without
     satellites. An error over 50 m counts as a wrong position. A further column is the 95th percentile of the ratio of
-    error to stated sigma. `ablation.csv` in DIR has all figures, and those of the conventional position;
-    `ablation.json` has the versions, inputs and settings.
+    error to stated sigma. `ablation.csv` in DIR has all figures, also for the conventional positions; `ablation.json`
+    has the versions, inputs and settings.
 
     Example:
 

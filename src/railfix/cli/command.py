@@ -1,4 +1,4 @@
-"""Base classes of the commands. Commands are loaded on demand, and end with a one-sentence message and an exit code."""
+"""Base classes of the commands. A command that fails ends with a one-sentence message and an exit code."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ class LazyCommands(Commands):
     """Group that imports a command's module only when the command is called; the help is made from `summaries`."""
 
     summaries: ClassVar[Mapping[str, str]] = {}
-    #: Module of each command whose module does not have the name of the command.
+    #: Modules of the commands whose module has another name than the command.
     modules: ClassVar[Mapping[str, str]] = {}
 
     def list_commands(self, ctx: Any) -> list[str]:
@@ -121,7 +121,7 @@ class LazyCommands(Commands):
         return [*super().list_commands(ctx), *self.summaries]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return a command; for names in `summaries`, a placeholder with name and summary for use in the help."""
+        """Return a command; for a name in `summaries`, it is a placeholder with name and summary, for the help."""
         if cmd_name in self.summaries:
             return Command(cmd_name, help=self.summaries[cmd_name])
         return super().get_command(ctx, cmd_name)
@@ -179,7 +179,7 @@ def run_program(app: typer.Typer) -> NoReturn:
 def _end_at_closed_pipe(number: int, _frame: object) -> None:
     """Exit if the reader of standard output has closed the pipe.
 
-    Otherwise another pipe is broken. The function then returns, so that the write to that other pipe fails.
+    Otherwise another pipe is broken. The function then returns, so that the write to this other pipe raises its error.
     """
     poll = select.poll()
     poll.register(1, 0)

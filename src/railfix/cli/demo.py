@@ -50,10 +50,10 @@ def demo(
     are written into DIR. Further outputs are the folder `unscreened`, with the run for the conventional positions, and
     the page `report.html`, to open in a browser.
 
-    With `--real`, the log is a car's drive of 20 minutes through a town, from the wheel `gnss-benchmark` (MIT) of the
-    package index. pip downloads the wheel, which is kept unpacked in the user's cache. The map is made from the drive's
-    ground truth, which is computed by RTKLIB if it is installed. `railfix benchmark` evaluates the positions of railfix
-    and of RTKLIB against the ground truth. The case is written into `DIR/drive`, and the results into `DIR/benchmark`.
+    With `--real`, the log is a car's drive of 20 minutes through a town, from the wheel `gnss-benchmark` (MIT). pip
+    downloads the wheel, which is kept unpacked in the user's cache. The map is made from the drive's ground truth,
+    which is computed by RTKLIB if it is installed. `railfix benchmark` evaluates the positions of railfix and of RTKLIB
+    against the ground truth. The case is written into `DIR/drive`, and the results into `DIR/benchmark`.
 
     Example: `railfix demo --out first-look`
 

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from railfix.evaluate import Evaluation
 
 
-#: Maximum number of rows printed of the table by section.
+#: Maximum number of printed rows of the table by section.
 _MOST_SECTIONS: Final = 20
 _MOST_BEYOND: Final = 5  #: Maximum number of printed epochs with an error above the protection level.
 
@@ -143,7 +143,7 @@ def evaluate(
 
 
 def _pair(runs: list[Path], reference: tuple[str, ...], label: tuple[str, ...]) -> list[RunAndReference]:
-    """Return for each run the reference, None if it is `auto`, and the label.
+    """Return the reference and the label of each run; the reference is None for `auto`.
 
     Raise SettingsError if the number of references or labels does not match the number of runs.
     """
@@ -170,17 +170,17 @@ def reference(
 ) -> None:
     r"""Build the reference trajectory of each antenna from RTK fixed positions on the track, and bridge its gaps.
 
-    A position is rejected if it is not an RTK fix, has a low ambiguity ratio, lies off the antenna's trajectory,
+    A position is rejected if it is not an RTK fix, has a low ambiguity ratio, is too far from the antenna's trajectory,
     disagrees with the distance travelled, or disagrees with the distance between the two antennas. The remaining
     positions are matched to the trajectory. The gaps between these positions are bridged with Doppler speeds,
-    tachometer pulses and accelerations, as far as they are given, each weighted by its variance. The closing error of a
-    gap is distributed over the gap. The following files are written into DIR:
+    tachometer pulses and accelerations, as far as they are given, each weighted by its inverse variance. The closing
+    error of a gap is distributed over the gap. The following files are written into DIR:
 
     - `reference.csv`: one row per instant and antenna; position, speed, standard deviation, source `rtk` or `bridged`
     - `fixes.csv`: every position with its test result and measurements
     - `reference.json`: versions, hashes of the inputs, settings given and used, counts by reason, gaps
 
-    Gaps that are too long, and instants with too large a standard deviation, are left out, counted and reported. All
+    Gaps that are too long, and instants with too large a standard deviation, are omitted, counted and reported. All
     times are GPS time.
 
     Example:

@@ -77,7 +77,7 @@ def monitor(
 ) -> None:
     """Monitor satellite positioning with three receivers at points with known coordinates.
 
-    The single-point fixes of the three receivers are computed from the same satellites. Each fix must lie within a
+    The single-point fixes of the three receivers are computed from the same satellites. Each fix must be within a
     circle around the receiver's known point, and the vectors between the fixes must agree with the vectors between the
     points. The first cause that stops the trains is latched and printed.
 
@@ -211,7 +211,7 @@ def keys(
     """Make keys and certificates for a control centre and trains, add trains, and renew certificates.
 
     A certificate authority signs the certificates; the key of the authority (authority.key) must stay in DIR. Copy
-    authority.pem and the centre's two files to the centre, and authority.pem and a train's two files to each train. If
+    authority.pem to the centre and to each train, and the key and certificate of the centre or train to its owner. If
     DIR already has a certificate authority, trains are added. The serial number of each certificate is printed; to
     revoke a certificate, write its serial number into revoked.txt in the centre's folder. Key files are readable only
     by the user who made them.

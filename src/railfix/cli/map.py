@@ -216,9 +216,9 @@ def from_positions_command(
 ) -> None:
     """Make a track map from the positions of one run.
 
-    Positions of another quality or at standstill are left out. The other positions are thinned to the spacing, and the
-    path deviates by at most 0.30 m from the line between two points. The map is the path of the antenna: use it without
-    a vehicle file. A run over several laps gives a map with several laps.
+    Positions without an accepted quality number and positions at standstill are omitted. The other positions are
+    thinned to the spacing; the chord between two points deviates by at most 0.30 m from the omitted positions. The map
+    is the path of the antenna: use it without a vehicle file. A run over several laps gives a map with several laps.
 
     Example: `railfix map from-positions rtk.pos --out line.csv --quality 1`
 

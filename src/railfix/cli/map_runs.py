@@ -142,7 +142,7 @@ def survey(
 
     Example: `railfix map survey monday.obs tuesday.obs --nav monday.nav --nav tuesday.nav --out line.csv`
 
-    Exit codes are listed in `railfix --help`; the code is 5 if the runs lie apart.
+    Exit codes are listed in `railfix --help`; the code is 5 if the runs are not on one line.
     """
     from railfix.run.locate import survey_files
     from railfix.track import write_track_csv

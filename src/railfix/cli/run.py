@@ -47,7 +47,7 @@ def run(
     Logs are RINEX 2, 3 and 4 (plain, .gz, .Z, Hatanaka), UBX, SBF or RTCM 3. The following files are written into DIR:
 
     - `positions.csv` and `positions.parquet`: chainage with standard deviation, coordinates, and the conventional
-      position for comparison; one row per epoch and antenna, also without a position
+      position for comparison; one row per epoch and antenna, also for epochs without a position
     - `train.csv` and `train.parquet` (unless `--filter off`): positions of the filter along the track, each computed
       from all measurements up to the epoch, with speed, direction and the probability of the branch; with `--smooth`,
       also positions computed from earlier and later measurements

@@ -113,8 +113,7 @@ def choices(screens: Sequence[str]) -> dict[str, tuple[str, ...]]:
 
 
 def filter_choices(inputs: RunInputs, sources: Sequence[FilterSource]) -> dict[str, tuple[FilterSource, ...]]:
-    """Return the choices of filter sources by name: all available sources, and all except one (other than the
-    codes)."""
+    """Return the choices of filter sources by name: all available sources, and all except one; none lacks the codes."""
     absent = [source for source, names in _SENSORS.items() if any(getattr(inputs, name) is None for name in names)]
     there = tuple(source for source in sources if source not in absent)
     return {FILTER: there} | {

@@ -191,8 +191,7 @@ def _evaluate(
     files: TrackFiles,
     options: EvaluationOptions,
 ) -> tuple[EvaluatedRun, list[pl.DataFrame], Level | None]:
-    """Return an evaluated run without a name, the epochs of each antenna, and the kind and limit of its protection
-    levels.
+    """Evaluate a run; return it without a name, the epochs of its antennas, and the kind and limit of its levels.
 
     References that are read from files are kept in `read`, so that several runs share them.
     """
@@ -318,8 +317,7 @@ def configurations(settings: Sequence[Mapping[str, Any]], given: Sequence[str]) 
 
 
 def _name_runs(runs: Sequence[EvaluatedRun]) -> list[EvaluatedRun]:
-    """Return the runs with configurations and short distinct names, which end with the table's name, except
-    `positions`."""
+    """Return the runs with configurations and short distinct names, in which the table name `positions` is omitted."""
     settings = [dict(run.settings) | {"table": run.table} for run in runs]
     labels = configurations(settings, [run.configuration for run in runs])
     ends = ["" if run.table == POSITIONS_TABLE else f" ({run.table})" for run in runs]

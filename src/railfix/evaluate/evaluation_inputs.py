@@ -140,8 +140,7 @@ class RunFolder(RunRecord):
         return float(limit)
 
     def prefix_column(self, name: str) -> str:
-        """Return the name that a column has in tables of several runs: columns of protection levels have their kind as
-        prefix."""
+        """Return a column's name in tables of several runs; columns of protection levels have their kind as prefix."""
         return f"{self.level_kind}_{name}" if name.startswith("protection_") and self.level_kind else name
 
     @property

@@ -242,8 +242,7 @@ def _count(
 
 
 def _pool(rows: list[dict[str, Any]]) -> pl.DataFrame:
-    """Return the counts and fractions as a table; further rows are sums over antennas and over runs of a
-    configuration."""
+    """Return the counts and fractions as a table, with sums over both antennas and over a configuration's runs."""
     parts = [pl.DataFrame(rows, schema_overrides={"alarm_limit_m": pl.Float64})]
     if parts[0]["antenna"].n_unique() > 1:
         parts.append(parts[0].with_columns(antenna=pl.lit(ALL)))

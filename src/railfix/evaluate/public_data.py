@@ -1,5 +1,4 @@
-"""Public recordings in the Python wheel `gnss-benchmark` (MIT) of the Python Package Index, unpacked in the user's
-cache.
+"""Public recordings in the wheel `gnss-benchmark` (MIT) on the Python Package Index, unpacked in the user's cache.
 
 The wheel contains a drive of 20 minutes through a town and the log of a station 14 km away (Septentrio mosaic-X5, 1 Hz,
 November 2020), and logs of static antennas. The drive is a held-out case: neither settings nor constants were chosen

@@ -218,8 +218,7 @@ def group_tables(evaluation: Evaluation) -> list[Table]:
 
 
 def level_tables(evaluation: Evaluation, *, worst: int) -> list[Table]:
-    """Return the tables of protection levels, of Stanford counts, and of epochs whose error exceeds the protection
-    level.
+    """Return the tables of protection levels, their Stanford counts, and epochs whose error exceeds the level.
 
     For each kind of level, only the `worst` epochs with the largest excess are listed.
     """

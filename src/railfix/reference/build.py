@@ -280,8 +280,7 @@ class _ReferenceBuilder:
     def _travel(
         self, time: Datetimes, speeds: SolvedSpeeds, wheel: Wheel | None, fixes: Fixes, settings: ReferenceSettings
     ) -> tuple[Floats, Floats]:
-        """Return the distance travelled up to each time, and its variance, from the wheel if any, else from
-        Dopplers."""
+        """Return the distance travelled up to each time, and its variance, from the wheel (if any) or Dopplers."""
         joined = self._join(speeds)
         if wheel is not None:
             way = wheel.distance_m(time, self._hint(time, joined, fixes))
