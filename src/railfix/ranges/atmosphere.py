@@ -98,7 +98,7 @@ def saastamoinen_delay_m(
 
 @dataclass(frozen=True, kw_only=True)
 class SeenFrom:
-    """Satellite directions from receiver positions accurate to hundreds of metres, T epochs by K channels."""
+    """Satellite directions at T epochs for K channels, from receiver positions accurate to hundreds of metres."""
 
     receiver_ecef_m: Floats  #: Position of the receiver, shape (T, 3).
     latitude_deg: Floats  #: Geodetic latitude of the receiver, shape (T,).
@@ -126,12 +126,12 @@ class SeenFrom:
 
 @dataclass(frozen=True, kw_only=True)
 class Delays:
-    """Atmospheric delays and the sigma of their residual errors, T epochs by K channels."""
+    """Atmospheric delays, and sigma of the corrected ranges, T epochs by K channels."""
 
     #: Ionospheric delay at the carrier frequency, shape (T, K); 0 if the model is off, NaN where SBAS has no delay.
     ionosphere_m: Floats
     troposphere_m: Floats
-    #: Sigma beyond local errors, shape (T, K); 0 with received Klobuchar coefficients, NaN where unknown.
+    #: Sigma to be added to receiver noise, shape (T, K); 0 with received Klobuchar coefficients, NaN where unknown.
     sigma_m: Floats
     reason: Bits  #: Rejection reasons (`Reason` bits) where a delay is unknown, shape (T, K).
 

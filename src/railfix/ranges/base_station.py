@@ -18,7 +18,7 @@ from railfix.ranges.channels import Channels
 from railfix.ranges.sources import BaseDifferences, CorrectionSource, SourceDelays, SourceSatellites
 
 Values = TypeVar("Values", Floats, Integers)
-#: A station epoch may be later than the train's epoch by this time [s], because the two receiver clocks differ.
+#: A station epoch may be up to this time [s] later than the train's epoch, because the two receiver clocks differ.
 _SAME_S: Final = 0.05
 #: Largest age of the station's code errors [s]; without selective availability, they change by centimetres in 30 s.
 LONGEST_AGE_S: Final = 60.0
@@ -79,7 +79,7 @@ class BaseErrors:
         return list(zip(self.satellite.tolist(), self.signal.tolist(), strict=True))
 
     def drop_before(self, time: np.datetime64) -> BaseErrors:
-        """Drop the epochs before `time`, and channels without a code error at the remaining epochs."""
+        """Return the epochs from `time` on, without channels that have no code error at these epochs."""
         rows = self.time >= time
         seen = np.isfinite(self.code_m[rows]).any(axis=0)
         return replace(

@@ -46,13 +46,13 @@ DFMC_SIGNALS: Final[Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]]] = {
 
 #: Signals with ten times the chip rate of L1 C/A, by constellation and band.
 _FAST: Final = ("G5", "J5", "E5", "E7", "C5", "C6")
-#: Ratio of their noise and multipath to L1 C/A at the same C/N0. Measured ratios are 0.4 on a phone (L5 to L1) and 0.8
-#: on an F9P (E5b to E1).
+#: Noise and multipath of the `_FAST` signals relative to L1 C/A at the same C/N0. Measured ratios are 0.4 on a phone
+#: (L5 to L1) and 0.8 on an F9P (E5b to E1).
 _FAST_NOISE: Final = 0.5
 
 
 def relative_noise(signal: str) -> float:
-    """Return the ratio of a signal's ("G5Q") noise and multipath to L1 C/A at the same C/N0."""
+    """Return the noise and multipath of a signal such as "G5Q", relative to L1 C/A at the same C/N0."""
     return _FAST_NOISE if signal[:2] in _FAST else 1.0
 
 

@@ -25,7 +25,7 @@ def _number(low: float, high: float) -> object:
 
 
 class _Curve(Settings):
-    """Curve of the file: the columns of a `Cn0Mean`."""
+    """Curve in the file, with the columns of `Cn0Mean`."""
 
     kind: str
     signal: str = Field(min_length=2, max_length=2)

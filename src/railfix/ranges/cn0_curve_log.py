@@ -24,7 +24,8 @@ from railfix.ranges.cn0_curve_fit import Cn0Samples, CurveFit, fit_cn0_curve
 
 _SHORT_S: Final = 12 * 3600.0  #: A shorter log causes a note; P1 2.3(1) requires about a day.
 _DEFICIT_DBHZ: Final = 10.0  #: P1 (table 6) rejects a signal whose C/N0 is this far below the mean [dB-Hz].
-#: A note is issued if more than this fraction of the samples above this elevation are `_DEFICIT_DBHZ` below the curve.
+#: Lowest elevation [deg] of the samples that are compared with the curve, and fraction of these samples. If a larger
+#: fraction is `_DEFICIT_DBHZ` below the curve, a note is issued.
 _CHECKED_FROM_DEG, _REJECTED_SHARE = 15.0, 0.01
 #: A tracked satellite below this elevation [deg] indicates a wrong antenna position.
 _BELOW_DEG: Final = -5.0

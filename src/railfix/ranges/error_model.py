@@ -145,7 +145,7 @@ class FaultRate(Settings):
     #: `side_prior` if it is small enough for a finite protection level.
     side_upper: float = Field(default=1.0, ge=0, le=1)
     #: Stretches with more frequent local faults than the line as a whole (`faulty_stretches`): first and last chainage
-    #: of each [m].
+    #: of each stretch [m].
     no_level_m: tuple[tuple[float, float], ...] = ()
 
     @property
@@ -164,7 +164,7 @@ class ErrorModel:
     #: "local": only multipath and receiver noise, because a reference station removed satellite and atmospheric errors.
     #: "satellite_and_atmosphere": in addition, satellite and atmospheric errors of the recorded days.
     covers: Literal["local", "satellite_and_atmosphere"]
-    #: Settings under which the model is valid. If None, they are unknown and not compared with a run's settings.
+    #: Settings under which the model is valid. With None, a run's settings are not compared.
     conditions: Conditions | None = None
     source: ErrorModelSource = field(default_factory=ErrorModelSource)
     #: Rate of local faults among the ranges to which the model was fitted; None if not measured.
@@ -183,7 +183,7 @@ class ErrorModel:
         return sigma, np.where(inside, self.after.bound_bias_m.ravel()[safe], np.nan)
 
     def missing_parts(self) -> tuple[str, ...]:
-        """Return one sentence for each part that the file of an earlier version lacks."""
+        """Return one sentence for each part that is missing because the file is of an earlier version."""
         if self.faults is None or "side_upper" in self.faults.model_fields_set:
             return ()
         return (

@@ -114,8 +114,8 @@ def signal_delays(navigation: Navigation, signal: str) -> tuple[Floats, Floats, 
 
 
 #: Standard deviation of the delay on L2 and L5 without ISC [m]. For GPS satellites whose CNAV had ISC on 2025-02-15,
-#: the difference between TGD - ISC and the value used instead has a standard deviation of 0.24 m on L2C and 0.55 m on
-#: L5Q (`tests/gnss/test_group_delays.py`).
+#: the difference between TGD - ISC and the delay used without ISC has a standard deviation of 0.24 m on L2C and 0.55 m
+#: on L5Q (`tests/gnss/test_group_delays.py`).
 _WITHOUT_ISC_M: Final[Mapping[str, float]] = {"2": 0.3, "5": 0.6}
 
 

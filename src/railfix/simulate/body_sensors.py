@@ -35,7 +35,7 @@ _WHEEL, _SLIPS, _TEETH, _MISCOUNT = 20, 21, 30, 31
 
 
 def wheel_slips(simulation: Simulation, settings: TachometerSettings) -> list[SlipInterval]:
-    """Return the slips and slides of the run in order of time: those given in the settings, and those drawn at random.
+    """Return the slips and slides of the run in order of time: those of the settings, and those drawn at random.
 
     A drawn slip or slide that overlaps another is left out.
     """

@@ -54,8 +54,8 @@ class Interpolated:
         self._before = nodes_before(spacing_s)
 
     def _place(self, time_s: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-        """Return the values at the four nodes around each time, (T, C), and the elapsed fraction of the time's cell,
-        (T, 1).
+        """Return the values at the four nodes around each time, (T, C), and the elapsed fraction of the interval, (T,
+        1).
         """
         place = np.asarray(time_s, dtype=np.float64) / self._spacing_s + self._before
         cell = np.floor(place).astype(np.intp)

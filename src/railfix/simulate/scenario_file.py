@@ -54,7 +54,7 @@ class Recipe:
     tables: tuple[Mapping[str, Any], ...]  #: Settings of each run, with absolute paths.
 
     def scenario(self, number: int = 0, *, changes: Mapping[str, Any] | None = None) -> Scenario:
-        """Return the scenario of a run, counted from 0; the settings `changes` override the settings of the file.
+        """Return the scenario of run `number` (from 0); the settings `changes` override the settings of the file.
 
         Raise SettingsError if a setting is misspelt, of the wrong type, or out of range, and InputFileError if the
         duration depends on a track file that cannot be read.

@@ -94,7 +94,7 @@ class SbasCorrections:
     def from_log(
         cls, messages: SbasMessages, *, prn: int | Literal["best"] = "best", limits: SbasLimits | None = None
     ) -> SbasCorrections:
-        """Return corrections from messages of the requested PRN or of `best_prn`; ValueError if there are none."""
+        """Return corrections from the requested PRN or `best_prn`; ValueError if the PRN has no messages."""
         prn, choice = best_prn(messages, limits) if prn == "best" else (prn, messages.describe_choice(prn))
         corrections = cls(messages, prn=prn, limits=limits, notes=(*messages.notes, choice))
         corrections.notes += tuple(corrections._leave_out(messages.of(prn)))

@@ -197,7 +197,7 @@ class DfmcService:
     def satellites(self, time: Datetimes, satellite: Strings, navigation: Navigation | None = None) -> DfmcCorrections:
         """Return the corrections of K satellites at T epochs.
 
-        A correction is used only if a navigation record has the same issue of data, or if no navigation data are given.
+        A correction is used only if a navigation record has the same issue of data, or if `navigation` is None.
         """
         shape = (len(time), len(satellite))
         names = np.array([slot_satellite(int(slot)) for slot in self._read[32]["slot"]], dtype="<U3")
@@ -386,7 +386,7 @@ class SbasOrbits:
         return np.where(self.usable[:, None], position, np.nan)
 
     def notes(self) -> tuple[str, ...]:
-        """Return a sentence on the last orbit with a position; an empty tuple without such an orbit."""
+        """Return a note on the last orbit that has a position; an empty tuple if there is none."""
         last = zip(self.prn[self.usable][-1:], self.position_ecef_m(self.reference)[self.usable][-1:], strict=True)
         return tuple(
             f"PRN {prn} is, by its own messages, at {float(geodetic_from_ecef(place)[1]):.1f} degrees east, "

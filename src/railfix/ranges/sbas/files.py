@@ -364,7 +364,7 @@ def _parity_notes(sources: tuple[str, ...], source: Integers, carried: Integers)
 
 
 def _order_notes(log: SbasMessages) -> list[str]:
-    """Return notes on messages whose preamble does not match the second of reception: time tags may be wrong."""
+    """Return notes on messages whose preamble does not match the second of reception, a sign of wrong time tags."""
     notes = []
     second = log.time.astype("datetime64[s]").astype(np.int64)
     number, turn = preamble_number(log.bits, log.band), len(PREAMBLES[log.band])

@@ -1,4 +1,4 @@
-"""Ionospheric grid of one GEO, and slant delays from it (DO-229D, A.4.4.9, A.4.4.10 and A.4.5.2)."""
+"""Ionospheric grid of one GEO, and slant delays from the grid (DO-229D, A.4.4.9, A.4.4.10 and A.4.5.2)."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ class SbasLimits(Settings):
     #: Satellites without degradation data are rejected, or used with the shortest time-out and a sigma increased by 8 m
     #: (DO-229D, J.2.2).
     incomplete: Literal["reject", "inflate"] = "reject"
-    #: Largest UDREI used; None is 11 for precision approach and 13 en route.
+    #: Largest UDREI used; with None, 11 for precision approach and 13 for en route.
     max_udrei: int | None = Field(default=None, ge=0, le=13)
     #: Time from the first bit of a message to the end of reception.
     message_s: float = Field(default=1.0, ge=0.0, le=2.0)

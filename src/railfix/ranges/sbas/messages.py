@@ -70,7 +70,7 @@ def message_type(bits: Bytes, band: Band = "L1") -> Integers:
 class SbasMessages(RowArrays, NotebookTable):
     """Messages that passed every check, N rows in the order of their reception."""
 
-    #: GPS time at which the message was completely received; it is used from this time on; shape (N,).
+    #: GPS time at which the message was completely received, shape (N,). The message is used from this time on.
     time: Datetimes
     prn: Integers  #: PRN of the GEO, shape (N,).
     type: Integers  #: Message type, 0 to 63, shape (N,).

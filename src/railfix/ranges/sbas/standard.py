@@ -79,7 +79,7 @@ STOP_S: Final = 60.0  #: A message of type 0 stops the use of the GEO for this t
 OLDEST_S: Final = max(of_mode for kind, both in TIMEOUT_S.items() if kind != "service" for of_mode in both)
 #: Message types that affect messages received later (stops and masks), and are therefore kept for twice `OLDEST_S`.
 LEANT_ON: Final = (0, 1, 18)
-INFLATION_M: Final = 8.0  #: Added to sigma UDRE where degradation data are missing [m] (DO-229D, J.2.2).
+INFLATION_M: Final = 8.0  #: Increase of sigma UDRE where degradation data are missing [m] (DO-229D, J.2.2).
 
 
 class SatelliteState(IntEnum):

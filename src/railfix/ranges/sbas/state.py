@@ -34,7 +34,7 @@ class SbasState:
         state = state.drop_before(time[-1])  # what later epochs need
     """
 
-    prn: int  #: PRN of the GEO, given beforehand, since the best PRN is known only after all messages.
+    prn: int  #: PRN of the GEO, set in advance, because the best PRN is known only after all messages.
     limits: SbasLimits = field(default_factory=SbasLimits)
     #: Messages of this PRN, in the order of reception.
     messages: SbasMessages = field(default_factory=SbasMessages.none)
