@@ -62,7 +62,7 @@ def test_a_register_without_geometry_is_a_sentence(tmp_path: Path) -> None:
     with pytest.raises(InputFileError, match=r"no era:LinearElement has a geometry"):
         read_segments(path, MapReading())
     path.write_text("no turtle")
-    with pytest.raises(InputFileError, match=r"this is no turtle"):
+    with pytest.raises(InputFileError, match=r"this is not valid turtle"):
         read_segments(path, MapReading())
     path.write_text(TURTLE.replace("era:isOnOriginOfElementB true", 'era:name "x"'))
     with pytest.raises(InputFileError, match=r"r1 has no isOnOriginOfElementB"):

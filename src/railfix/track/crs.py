@@ -1,6 +1,6 @@
 """Coordinate reference systems of maps, their relation to the ITRF, and PROJ operations between them.
 
-Definitions are from the EPSG dataset (https://epsg.org). The motions of countries relative to their plates appear only
+Definitions are from the EPSG dataset (https://epsg.org). Motions of countries relative to their plates are only stated
 in notes to the user.
 """
 
@@ -42,7 +42,7 @@ _ALIGNED: Final = {
     "ITRF2014": "IGS14, IGb14, WGS 84 (G2139), ATRF2014, SIRGAS-CON SIR17P01",
     "ITRF2020": "IGS20, WGS 84 (G2296)",
 }
-#: EPSG code of an ITRF realisation, by the name of the realisation or of a frame aligned with it.
+#: EPSG codes of ITRF realisations, by the name of the realisation or the name of a frame aligned with it.
 REALISATIONS: Final = _ITRF | {name: _ITRF[itrf] for itrf, names in _ALIGNED.items() for name in names.split(", ")}
 
 
@@ -53,9 +53,9 @@ class HeldFrame:
     itrf: str  #: Name of the ITRF realisation.
     epoch: float  #: Epoch of the coordinates [year].
     plate: str  #: Plate of the ITRF2020 plate motion model on which most of the country lies.
-    #: Smallest and largest motion of the country relative to the plate [mm per year].
+    #: Smallest and largest motion of a point in the country relative to the plate [mm per year].
     rest_mm: tuple[float, float] = (0.0, 1.0)
-    but: str = ""  #: Clause on further neglected motions, for the note to the user.
+    but: str = ""  #: Clause of the note to the user that states further neglected motions.
     #: Second plate of the country, and two points (latitude, longitude) on the border between both plates. Seen from
     #: the first point to the second, the second plate is on the right.
     border: tuple[str, tuple[float, float], tuple[float, float]] | None = None
@@ -81,7 +81,7 @@ class HeldFrame:
 
 
 _ANDES: Final = "as are earthquakes, metres in Chile since 2010"
-#: National frames that are ITRF realisations fixed at an epoch. PROJ does not model the motion since that epoch.
+#: National frames that are ITRF realisations at a fixed epoch. PROJ does not model the motion since this epoch.
 HELD: Final = {
     "JGD2011": HeldFrame(
         "ITRF2008", 2011.4, "EURA", (5.0, 30.0), "as is the epoch 1997.0 of western Japan (--map-epoch 1997)"
@@ -137,7 +137,8 @@ HELD: Final = {
     "Mexico ITRF2008": HeldFrame("ITRF2008", 2010.0, "NOAM", (0.0, 50.0)),
     "RGSPM06": HeldFrame("ITRF2000", 2006.0, "NOAM"),
 }
-#: Frames that are treated as another frame: EPSG code of this other frame, and clause on how well both frames agree.
+#: Frames that are treated as another frame. The value is the EPSG code of the other frame, and a clause on the
+#: differences between both frames.
 SAME: Final = {
     "NAD83(CSRS)": (
         "EPSG:8254",
@@ -154,8 +155,8 @@ SAME: Final = {
 TRANSIT: Final = "WGS 84 (Transit)"  #: First realisation of WGS 84, which differs by 0.8 m from later realisations.
 #: Frame in which positions are computed: the three-dimensional geographic CRS of ITRF2020.
 WORKING_FRAME: Final = "EPSG:9989"
-#: Frames in which the maps of their region usually are, with the EPSG code of the three-dimensional CRS. Where the
-#: areas of several frames overlap, the frame that is listed first is the most likely one.
+#: Usual frames of maps in a region, with the EPSG code of the three-dimensional CRS. Where the areas of several frames
+#: overlap, the first frame is the most likely one.
 REGIONAL: Final = {
     "ETRS89": "EPSG:4937", "NAD83(2011)": "EPSG:6319", "NAD83(CSRS)": "EPSG:8254", "GDA2020": "EPSG:7843",
     "JGD2011": "EPSG:6667", "KGD2002": "EPSG:4927", "TWD97": "EPSG:3823", "CGCS2000": "EPSG:4480",
@@ -164,13 +165,14 @@ REGIONAL: Final = {
 MARGIN_DEG: Final = 0.5  #: Margin that is added around the area of use of a CRS [deg].
 #: Largest accepted deviation of the scale of a grid from 1 along a line; national grids deviate by up to 0.005.
 LARGEST_SCALE: Final = 0.01
-#: Worst accuracy of a PROJ transformation between modern frames [m]. Transformations of older datums are less accurate.
+#: Worst accepted accuracy of a PROJ transformation to the working frame [m]. Transformations of older datums are less
+#: accurate.
 MODERN_M: Final = 0.5
 
 Box = tuple[float, float, float, float]  #: South, north, west and east [deg].
-#: Worst accuracy of an operation that is used [m]; 999 in the EPSG dataset means unknown.
+#: Worst accepted accuracy of an operation [m]. An accuracy of 999 m in the EPSG dataset means unknown.
 WORST_M: Final = 100.0
-#: Beginnings of the names of those steps of a PROJ operation that do not change the datum.
+#: The steps of a PROJ operation that do not change the datum have names that begin with these words.
 _NO_DATUM_CHANGE: Final = ("axis order change", "Conversion from", "Null geographic offset", "Inverse of Conversion")
 Kind = Literal["wgs84", "moves with its plate", "dynamic", "older datum"]
 
@@ -195,7 +197,7 @@ def kind_of_frame(crs: str) -> Kind:
 
 @lru_cache(maxsize=64)
 def _system(crs: str) -> CRS:
-    """Return the CRS with a name; raise CRSError if the name is unknown.
+    """Return the CRS that has a given name; raise CRSError if the name is unknown.
 
     CRS are cached, because PROJ takes a millisecond to create one.
     """
@@ -203,7 +205,7 @@ def _system(crs: str) -> CRS:
 
 
 def find_crs(crs: str, *, path: FilePath = "") -> CRS:
-    """Return the CRS with a name; raise SettingsError, with the file `path`, if PROJ does not know the name."""
+    """Return the CRS that has a given name; raise SettingsError that states `path` if PROJ does not know the name."""
     try:
         return _system(crs)
     except CRSError:
@@ -214,11 +216,10 @@ def find_crs(crs: str, *, path: FilePath = "") -> CRS:
 
 
 def choose_crs(path: FilePath, given: str | None, named: str | None) -> str | None:
-    """Return the CRS of a file, from the user (`given`) or from the file (`named`); None if neither states a CRS.
+    """Return the CRS of a file, either from the user (`given`) or from the file (`named`); None if neither states one.
 
-    If both state the same horizontal CRS, the CRS of the file is returned. If the user's CRS is a compound CRS, it is
-    returned instead, because it also has a height datum. Raise SettingsError if the two CRS contradict each other, or a
-    CRS is unknown.
+    If both state the same horizontal CRS, the file's CRS is returned, unless the user's CRS is a compound CRS, which
+    also has a height datum. Raise SettingsError if the two CRS contradict each other, or a CRS is unknown.
     """
     if given is None or named is None:
         used = given or named
@@ -260,7 +261,7 @@ def get_geodetic_frame(crs: str) -> CRS:
     geodetic = find_crs(crs).geodetic_crs
     if geodetic is None:
         raise SettingsError(f"the CRS {crs!r} has no geodetic frame; give for example EPSG:4258 (ETRS89)")
-    # a CRS without names, such as +proj=utm +zone=32 +datum=WGS84, is identified by its datum
+    # a CRS without a name, such as +proj=utm +zone=32 +datum=WGS84, is identified by its datum
     authority = geodetic.to_authority() if geodetic.name == "unknown" else None
     return geodetic if authority is None else CRS.from_authority(*authority)
 
@@ -282,18 +283,17 @@ def find_operation(crs: str) -> Transformer | None:
 
 @dataclass(frozen=True, kw_only=True)
 class Operations:
-    """PROJ's operations between two CRS that are valid within a box."""
+    """PROJ operations between two CRS that are valid within a box."""
 
     usable: tuple[Transformer, ...]  #: Usable operations, best first.
     lacking: tuple[Any, ...] = ()  #: Operations whose grids are not installed.
 
     def describe_lacking(self, crs: str | None = None) -> str:
-        """Return a clause that names the best operation whose grid is not installed, and states how to get the grid.
+        """Return a clause on the best operation whose grids are not installed, and on how to get the grids.
 
         The clause is empty if there is no such operation.
 
-        An operation whose grids can be downloaded by projsync is preferred. Among equal operations, the most accurate
-        is the best.
+        Operations whose grids can be downloaded by projsync are preferred; among these, the most accurate is the best.
         """
         if not self.lacking:
             return ""
@@ -316,7 +316,7 @@ def _is_served(operation: Any) -> bool:
 
 
 def name_operation(description: str, crs: str | None = None) -> str:
-    """Return the name of a PROJ operation without the steps that do not change the datum; `crs` is the source CRS."""
+    """Return the name of a PROJ operation without steps that do not change the datum; `crs` is the source CRS."""
     system = None if crs is None else find_crs(crs).to_2d()
     conversion = None if system is None else system.coordinate_operation
     left_out = (*_NO_DATUM_CHANGE, *([f"Inverse of {conversion.name}"] if conversion is not None else []))
@@ -327,8 +327,8 @@ def name_operation(description: str, crs: str | None = None) -> str:
 def find_operations(source: CRS, target: CRS, box: Box | None = None) -> Operations:
     """Find PROJ's operations between two CRS that are valid in a box, except ballpark operations.
 
-    Without a box, all operations are returned in PROJ's order. With a box, operations worse than `WORST_M` are left
-    out.
+    Without a box, all operations are returned in PROJ's order. With a box, usable operations worse than `WORST_M` are
+    left out.
     """
     area: Any = None if box is None else AreaOfInterest(box[2], box[0], box[3], box[1])
     with warnings.catch_warnings():

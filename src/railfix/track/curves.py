@@ -20,15 +20,14 @@ from railfix.core.geodesy import axes_at
 from railfix.track.track import Track
 from railfix.track.trajectory import Trajectory
 
-#: Largest difference between two values of a chord's middle ordinate, one from the map's radius and one from
-#: neighbouring points [m]. If the difference is larger, the radius is not used, because it belongs to another point or
-#: has the wrong sign.
+#: Largest accepted difference between a chord's middle ordinate from the map's radius and from neighbouring points [m].
+#: At a larger difference the radius is not used, because it belongs to another point or has the wrong sign.
 _AGREES_M: Final = 0.03
 _CORNER_RAD: Final = 0.25  #: Change of direction above which a point is a corner, which the curve does not round [rad].
 #: Minimum distance of a ramp's end from the points before and after it, as a fraction of the distance between these
 #: points.
 _BREAK_SHARE: Final = 1e-3
-#: Minimum change of slope at a ramp's end, times the distance between the points before and after it.
+#: Minimum product of the change of slope at a ramp's end and the distance between the points around the end.
 _LEAST_BREAK: Final = 1e-4
 _CHORD_M: Final = 2e-3  #: Largest distance of the curve from the chords of `curved_line` [m].
 
@@ -39,10 +38,9 @@ class CentreCurve:
 
     chainage_m: Floats  #: Chainages of the points, shape (V,).
     points_m: Floats  #: ECEF coordinates of the points, shape (V, 3).
-    #: Directions of the curve relative to the chord at start and end of each segment, positive to the right, (V - 1, 2)
-    #: [rad].
+    #: Horizontal angles from chord to curve at start and end of each segment, positive right, shape (V - 1, 2) [rad].
     to_right: Floats
-    to_top: Floats  #: The same directions upward, shape (V - 1, 2) [rad].
+    to_top: Floats  #: Vertical angles from chord to curve, positive up, shape (V - 1, 2) [rad].
 
     @cached_property
     def length_m(self) -> Floats:
@@ -143,10 +141,10 @@ def _slopes(curvature: Floats, turn: Floats, length_m: Floats, corner: Floats) -
 
 
 def with_breaks(place_m: Floats, values: Floats) -> tuple[Floats, Floats]:
-    """Return a piecewise linear function with additional points at those ends of ramps that lie between points.
+    """Insert the ends of ramps that lie between two points into a piecewise linear function.
 
-    A ramp ends between two points if the line through the two points before the end and the line through the two points
-    after the end intersect at this end. Chainages `place_m` and `values` have shape (V,).
+    A ramp ends between two points if the line through the two points before them and the line through the two points
+    after them intersect there. Chainages `place_m` and `values` have shape (V,).
     """
     if len(place_m) < 4:
         return place_m, values
@@ -166,7 +164,7 @@ def with_breaks(place_m: Floats, values: Floats) -> tuple[Floats, Floats]:
 def curved_line(track: Track) -> Trajectory:
     """Compute the centreline of a track as a trajectory whose chords are within 2 mm of the curve.
 
-    Unknown cant is replaced by 0, unless the cant of every point is unknown.
+    Unknown cant is replaced by 0. If the cant of all points is unknown, it remains NaN.
     """
     curve = centre_curve(track)
     chainage = curve.chords_m(_CHORD_M)

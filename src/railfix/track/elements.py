@@ -1,4 +1,4 @@
-"""Elements of an alignment in plan, profile and cant, as in design files (IFC, LandXML), and points on them.
+"""Elements of an alignment in plan, profile and cant, as in design files (IFC, LandXML), and points of the alignment.
 
 The direction is the integral of the curvature in closed form. The position is the integral of the direction, by
 Gauss-Legendre quadrature. As in IFC 4.3 and LandXML, lengths are in plan, directions are counter-clockwise from the x
@@ -25,8 +25,9 @@ from railfix.track.heights import heights_of_file
 from railfix.track.route import MapReading, Segment, make_segment
 from railfix.track.transitions import OrdinateElement
 
-#: Laws by which curvature or cant changes along an element (IFC 4.3.2), two functions each. The first is the fraction
-#: of the change that is reached at the fraction t of the length. The second is the integral of the first from 0 to t.
+#: Laws by which curvature or cant changes along an element (IFC 4.3.2). The first function of a law is the fraction of
+#: the change that is reached at the fraction t of the length. The second function is the integral of the first one from
+#: 0 to t.
 LAWS: Final[dict[str, tuple[Callable[[Floats], Floats], Callable[[Floats], Floats]]]] = {
     "linear": (lambda t: t, lambda t: t**2 / 2.0),
     "bloss": (lambda t: 3.0 * t**2 - 2.0 * t**3, lambda t: t**3 - t**4 / 2.0),
@@ -45,13 +46,13 @@ LAWS: Final[dict[str, tuple[Callable[[Floats], Floats], Callable[[Floats], Float
     ),
 }
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
-#: Largest turn within one quadrature interval [rad]; up to this turn, 12 nodes are exact to rounding.
+#: Largest turn within one quadrature interval [rad], up to which 12 nodes are exact except for rounding errors.
 _PIECE_RAD: Final = 0.5
 _CHORD_M: Final = 0.01  #: Largest distance between the chords of an alignment's points and the alignment [m].
 _LONGEST_M: Final = 25.0  #: Largest spacing of an alignment's points [m].
 #: Number of points on a profile clothoid; linear interpolation between the points is accurate to 1 um.
 _CLOTHOID_POINTS: Final = 2001
-#: Distance between the end of an element and the start of the next element above which a note is given [m].
+#: Distance between an element's end and the next element's start above which a note is given [m].
 _JOINT_M: Final = 0.01
 
 
@@ -67,8 +68,9 @@ class PlanElement:
 
     length_m: float
     law: str = "linear"  #: Law of the curvature, a key of `LAWS`.
-    #: For a Viennese bend, height of the centre of gravity times the change of the cant angle, positive where the right
-    #: rail rises; the law then describes the path of the centre of gravity. For other laws 0.
+    #: For a Viennese bend, the height of the centre of gravity times the change of the cant angle, positive if the
+    #: right rail rises. The law of a Viennese bend is for the path of the centre of gravity. For other laws, the value
+    #: is 0.
     lean_m: float = 0.0
 
     def curvature_at(self, way_m: Floats) -> Floats:
@@ -108,15 +110,15 @@ Plan = PlanElement | OrdinateElement
 class Stations:
     """Stations (kilometrage) of an alignment, which may jump at station equations."""
 
-    #: One row for the start and one for each jump, in order of distance [m]. A row has the distance in plan from the
-    #: start of the alignment, the station just before the jump, and the station just after the jump.
+    #: One row for the start and one row for each jump, in order of distance. A row has the distance in plan from the
+    #: start of the alignment, the station just before the jump, and the station just after the jump [m].
     rows: tuple[tuple[float, float, float], ...]
     last_sign: float = 1.0  #: 1 if the stations rise after the last row, -1 if they fall.
     jump_m: float = 0.05  #: Half length of the interval within which the kilometrage jumps.
 
     @property
     def places_m(self) -> Floats:
-        """Distances in plan from the start, for the points on both sides of each jump [m]."""
+        """Distances in plan from the start to the points before and after each jump [m]."""
         place = np.array([row[0] for row in self.rows[1:]])
         return np.concatenate([place - self.jump_m, place + self.jump_m])
 
@@ -167,13 +169,13 @@ class ProfileElement:
 
     @cached_property
     def _clothoid(self) -> tuple[Floats, Floats, Floats]:
-        """Return points of a clothoid: distances in plan and heights, both from its start, and gradients.
+        """Return points of a clothoid: distances in plan from its start, heights above its start, and gradients.
 
         The slope angle is a quadratic function of the length along the curve.
         """
         start, turn = np.arctan(self.first), np.arctan(self.last) - np.arctan(self.first)
         length = self.length_m
-        # iterate the length along the curve until the projection of the curve is as long as the length in plan
+        # iterate the length along the curve until the curve has the given length in plan
         for _ in range(20):
             way = np.linspace(0.0, length, _CLOTHOID_POINTS)
             angle = start + self.bend * way + (turn - self.bend * length) * (way / length) ** 2
@@ -250,11 +252,9 @@ def plan_starts(plan: Sequence[Plan]) -> Floats:
 
 
 def _by_start(place_m: Floats, starts: Sequence[float] | Floats) -> list[tuple[Masks, int]]:
-    """Return, for each element that contains some of the distances, the mask of these distances and the element's
-    index.
+    """Return the mask of distances on each element, and the element's index; elements without distances are left out.
 
-    A distance belongs to the last element that starts before it. A distance before all elements belongs to the first
-    one.
+    A distance belongs to the last element that starts before it, or to the first element.
     """
     if not len(starts):
         return []
@@ -268,7 +268,7 @@ def alignment_points(
     cant: Sequence[CantElement],
     at_m: Sequence[float] | Floats = (),
 ) -> tuple[AlignmentPoints, tuple[str, ...]]:
-    """Compute points of an alignment, and a note on successive elements that do not meet.
+    """Compute points of an alignment, and notes on successive elements that do not meet.
 
     The chords between the points are within 1 cm of the alignment.
 
@@ -291,20 +291,20 @@ def alignment_points(
     ]
     wide = [gap for gap in gaps if gap > _JOINT_M]
     notes = (
-        (f"{len(wide)} of {len(gaps)} successive pairs of elements do not meet, widest gap {max(wide):.3f} m",)
+        (f"{len(wide)} of {len(gaps)} pairs of successive elements do not meet; the widest gap is {max(wide):.3f} m",)
         if wide
         else ()
     )
     return alignment_at(place, plan, profile, cant), notes
 
 
-#: Largest accepted length of an alignment beyond the ends of its profile [m]. There, the gradient is continued.
+#: Largest accepted length of an alignment without a profile [m]; the outermost gradients continue there.
 _PROFILE_BEYOND_M: Final = 50.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Design:
-    """Elements of one alignment in the order of the line, and the stations of the alignment."""
+    """Elements of one alignment in order of chainage, and the stations of the alignment."""
 
     plan: Sequence[Plan]
     profile: Sequence[ProfileElement] = ()
@@ -376,9 +376,9 @@ def segment_of_design(
 
 
 def _check_profile(plan: Sequence[Plan], profile: Sequence[ProfileElement], *, path: str) -> tuple[str, ...]:
-    """Check that a profile covers the plan, and return a note on uncovered length.
+    """Check that a profile covers the plan, and return a note on the length without a profile.
 
-    Raise InputFileError if more than `_PROFILE_BEYOND_M` is uncovered.
+    Raise InputFileError if this length exceeds `_PROFILE_BEYOND_M`.
     """
     length, low = sum(element.length_m for element in plan), min(element.start_m for element in profile)
     high = max(element.start_m + element.length_m for element in profile)
@@ -390,9 +390,9 @@ def _check_profile(plan: Sequence[Plan], profile: Sequence[ProfileElement], *, p
 
 
 def _check_length(plan: Sequence[Plan], place: Georeference, *, path: str) -> None:
-    """Raise InputFileError if the length of an alignment on the map differs from its design length.
+    """Raise InputFileError if an alignment's length on the map differs from its design length.
 
-    The lengths differ if the CRS is wrong, or elements do not meet.
+    Causes of a difference are a wrong CRS, and elements that do not meet.
     """
     designed = sum(element.length_m for element in plan)
     geod = CRS.from_user_input(place.frame).get_geod()
@@ -406,9 +406,9 @@ def _check_length(plan: Sequence[Plan], place: Georeference, *, path: str) -> No
 
 
 def _side_of_curve(curvature: Floats, bent: Masks) -> Floats:
-    """Return the sign of the curvature at each point or, on straight track, of the nearest curve, shape (n,).
+    """Return the sign of each point's curvature or, on straight track, of the nearest curve's curvature, shape (n,).
 
-    The nearest curve is used because a cant ramp can begin on straight track. Without any curve, the sign is 1.
+    The nearest curve is used because a cant ramp can begin on straight track. Without curves, the sign is 1.
     """
     if not bent.any():
         return np.ones(len(curvature))

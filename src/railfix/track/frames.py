@@ -43,7 +43,7 @@ class FrameShift:
     frame: str  #: Name of the map's frame.
     used: str  #: Frame and epoch of the transformed map, and of positions computed with this map.
     method: str  #: Description of the transformation.
-    #: Shift at the middle point of the line.
+    #: Shift at the middle of the line, to east, north and up.
     east_m: float = 0.0
     north_m: float = 0.0
     up_m: float = 0.0
@@ -84,9 +84,9 @@ class MapMotion(TypedDict, total=False):
 
     epoch: float | None  #: Epoch of the map's coordinates, for a frame that is an ITRF realisation [year].
     plate: str | None  #: Plate, one of `PLATES`, with which ITRF coordinates move from `epoch` to the time of the log.
-    #: Parameter file of the semi-dynamic correction of Japan (``SemiDynaEXE`` format). It transforms JGD2011 to the
-    #: epoch of the file, with crustal deformation. `epoch` then states the epoch of the file; after this epoch, the
-    #: plate motion is used.
+    #: Parameter file of Japan's semi-dynamic correction (``SemiDynaEXE`` format). It transforms JGD2011 to the file's
+    #: epoch, including crustal deformation. With this file, `epoch` is the epoch of the file, after which the plate
+    #: motion is used.
     parameters: FilePath | None
 
 
@@ -110,14 +110,14 @@ def points_at(
     ----------
     ecef_m : ndarray, shape (n, 3) [m]
     crs : str
-        CRS of the map. `named` is False if the map names no frame, so that the CRS is an assumption.
+        CRS of the map. It is an assumption if `named` is False, because the map names no frame.
     time : datetime64
         Time of the log.
 
     Returns
     -------
     tuple
-        Transformed points, shape (n, 3) [m], and a description with the shift at the middle point.
+        Transformed points, shape (n, 3) [m], and a description of the transformation.
 
     Raises
     ------
@@ -166,9 +166,9 @@ def _transform(operation: Transformer, ecef_m: Floats, year: float) -> Floats:
 def in_map_frame(
     ecef_m: Floats, crs: str, time: np.datetime64, *, named: bool = True, **motion: Unpack[MapMotion]
 ) -> tuple[Floats, FrameShift]:
-    """Transform positions, shape (n, 3) [m], from the frame of the satellites to the frame of a map.
+    """Transform positions, shape (n, 3) [m], from the satellites' frame to the frame of a map.
 
-    The shift computed by `points_at` is subtracted. Unknown positions (NaN) stay NaN. Raise MismatchError if all
+    The shift computed by `points_at` is subtracted. Positions that are NaN remain NaN. Raise MismatchError if all
     positions are NaN.
     """
     known = np.flatnonzero(np.isfinite(ecef_m[:, 0]))
@@ -196,7 +196,7 @@ def _from_dynamic(
         )
         return moved, f"{name} at the epoch of the log", (note,)
     if plate is None:
-        note = f"map: {name} at {epoch:g} is not moved to {year:.2f}, because no plate is given (1 to 8 cm per year)"
+        note = f"map: {name} at {epoch:g} is not moved to {year:.2f} (1 to 8 cm per year), because no plate is given"
         return moved, f"{name} at {epoch:g}, not moved", (note,)
     return _by_plate(moved, plate, year - epoch), f"{name} at {epoch:g}, motion of the plate {plate}", ()
 
@@ -211,8 +211,8 @@ def _from_held(
 ) -> tuple[Floats, str, tuple[str, ...]]:
     """Move coordinates of a frame fixed at an ITRF epoch to `year`.
 
-    By default, they move with the plate on which the middle point lies. Return the coordinates, a description, and
-    notes.
+    By default, the plate is the one on which the line's middle point lies. Return the coordinates, a description of the
+    transformation, and notes.
     """
     since = epoch or held.epoch
     latitude, longitude, _ = geodetic_from_ecef(ecef_m[len(ecef_m) // 2])
@@ -223,7 +223,7 @@ def _from_held(
 
 
 def _realisation_note(frame: CRS, operation: Transformer) -> tuple[str, ...]:
-    """Return a note if the frame is a datum ensemble, or is treated as another frame; otherwise an empty tuple."""
+    """Return a note if the frame is a datum ensemble or is treated as another frame, otherwise an empty tuple."""
     if frame.name in SAME and not operation.description.startswith(frame.name):
         code, how_well = SAME[frame.name]
         return (f"map: {frame.name} is taken as {CRS.from_user_input(code).name}; {how_well}",)
@@ -240,11 +240,10 @@ def _realisation_note(frame: CRS, operation: Transformer) -> tuple[str, ...]:
 def _by_parameters(
     ecef_m: Floats, path: FilePath, year: float, epoch: float | None, plate: str
 ) -> tuple[Floats, str, tuple[str, ...]]:
-    """Transform JGD2011 coordinates by a semi-dynamic correction, and from the epoch of the correction on by plate
-    motion.
+    """Transform JGD2011 coordinates by a semi-dynamic correction to its epoch, and then by plate motion.
 
-    The correction is computed once in each cell of 0.001 deg. Raise InputFileError if the file is not valid or does not
-    cover the map.
+    The correction is computed once for each cell of 0.001 deg. Raise InputFileError if the file is not valid or does
+    not cover the map.
     """
     with needs_extra(f"{path}: semi-dynamic correction"):
         import jgdtrans
@@ -275,9 +274,7 @@ def _by_plate(ecef_m: Floats, plate: str, years: float) -> Floats:
 
 
 def _doubt(ecef_m: Floats, time: np.datetime64) -> tuple[str, ...]:
-    """Return a note that WGS 84 is assumed, with the displacement of a point if the map is in a frame of its region
-    instead.
-    """
+    """Return a note that WGS 84 is assumed, with the resulting error if the map is in a usual frame of its region."""
     latitude, longitude, _ = (float(v) for v in geodetic_from_ecef(ecef_m))
     found = []
     for name, code in REGIONAL.items():

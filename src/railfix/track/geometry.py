@@ -10,8 +10,7 @@ from railfix.core.arrays import Floats, Integers
 from railfix.core.geodesy import enu_axes
 from railfix.track.track import Track
 
-#: Length over which the curvature from the points and the curvature from the map's radius are averaged before they are
-#: compared [m].
+#: Length of the moving average of curvatures, from the points and from the map's radius [m].
 _BEND_WINDOW_M = 40.0
 
 
@@ -20,24 +19,24 @@ class Geometry:
     """Spacing, curvature and gradients of a track of V points."""
 
     spacing_m: Floats  #: Length of each segment, shape (V - 1,).
-    #: Horizontal turn at each point, positive to the right; NaN at the ends and at duplicates; shape (V,).
+    #: Change of direction at each point, positive to the right, shape (V,); NaN at the ends and at duplicates.
     turn_deg: Floats
-    reach_m: Floats  #: Mean length of the two segments at each point; NaN where `turn_deg` is NaN; shape (V,).
+    reach_m: Floats  #: Mean length of the two segments at each point, shape (V,); NaN where `turn_deg` is NaN.
     #: Distance from chord to arc at the middle of each segment, ``L^2 / (8 R)``, positive in a right curve; shape (V -
-    #: 1,). The radius R is from the map if the map has it at both ends, otherwise from circles through neighbouring
-    #: points.
+    #: 1,). The radius R is from the map if the map has a radius at both ends of the segment, otherwise from circles
+    #: through neighbouring points.
     mid_chord_m: Floats
-    gradient_permille: Floats  #: Gradient from the heights; NaN at duplicates; shape (V - 1,).
-    #: Height of a point above the straight line between both neighbours; NaN at the ends; shape (V,).
+    gradient_permille: Floats  #: Gradient from the heights, shape (V - 1,); NaN at duplicate points.
+    #: Height of each point above the straight line between its neighbours, shape (V,); NaN at the ends.
     height_spike_m: Floats
-    #: Mean curvature over 40 m from `Track.radius_m`, positive to the right; NaN where unknown; shape (V,) [1/m].
+    #: Curvature from `Track.radius_m`, averaged over 40 m, positive to the right, shape (V,) [1/m]; NaN where unknown.
     map_curvature: Floats
-    #: Mean curvature over 40 m from the points, positive to the right; shape (V,) [1/m].
+    #: Curvature from the points, averaged over 40 m, positive to the right, shape (V,) [1/m].
     point_curvature: Floats
 
 
 def compute_geometry(track: Track) -> Geometry:
-    """Compute the geometry of a track; duplicate points are skipped."""
+    """Compute the geometry of a track, without its duplicate points."""
     spacing = np.diff(track.chainage_m)
     kept = np.concatenate([[0], np.flatnonzero(spacing > 0.0) + 1])
     if len(kept) < 2:
@@ -70,7 +69,7 @@ def compute_geometry(track: Track) -> Geometry:
 
 
 def _windows(along: Floats, window_m: float) -> tuple[Floats, Floats]:
-    """Compute the chainages of start and end of a window centred on each point, limited to the line, shape (V,) [m]."""
+    """Return the start and end of a window centred on each point, as chainages limited to the line, shape (V,) [m]."""
     return np.maximum(along - window_m / 2.0, along[0]), np.minimum(along + window_m / 2.0, along[-1])
 
 
@@ -90,7 +89,7 @@ def _plan_steps(track: Track, kept: Integers) -> tuple[Floats, Floats]:
 
 
 def _turns(plan: Floats) -> tuple[Floats, Floats]:
-    """Compute turns to the right between successive steps [rad], and mean lengths of both [m], shape (n - 1,) each."""
+    """Compute the right turns between successive steps [rad], and the mean lengths of both steps [m]."""
     cross = plan[:-1, 1] * plan[1:, 0] - plan[:-1, 0] * plan[1:, 1]
     dot = np.einsum("ni,ni->n", plan[:-1], plan[1:])
     length = np.hypot(plan[:, 0], plan[:, 1])
@@ -113,7 +112,7 @@ def _circle_curvature(plan: Floats) -> Floats:
 
 
 def _mean_over(along: Floats, values: Floats, low: Floats, high: Floats) -> Floats:
-    """Compute the means of a piecewise linear function from `low` to `high`; NaN if a part of it is unknown."""
+    """Compute means of a piecewise linear function from `low` to `high`; NaN where a value in this range is unknown."""
     unknown = np.isnan(values)
 
     def between(part: Floats) -> Floats:
@@ -125,7 +124,7 @@ def _mean_over(along: Floats, values: Floats, low: Floats, high: Floats) -> Floa
 
 
 def _bend(track: Track, kept: Integers, turn: Floats) -> Floats:
-    """Compute the curvature from the change of heading over a window, which averages noise, shape (V,) [1/m]."""
+    """Compute the curvature as change of heading over a window, to average out noise, shape (V,) [1/m]."""
     along = track.chainage_m
     heading = np.concatenate([[0.0], np.cumsum(turn)])
     middle = (along[kept][1:] + along[kept][:-1]) / 2.0
@@ -137,9 +136,9 @@ def _bend(track: Track, kept: Integers, turn: Floats) -> Floats:
 
 
 def mean_gradients(track: Track, *, window_m: float) -> tuple[Floats, Floats]:
-    """Compute mean gradients over a window, from the map's gradients and from the heights, shape (V,) each.
+    """Compute mean gradients over a window, both from the map's gradients and from the heights, shape (V,) [permille].
 
-    The gradients are in permille. They are NaN where unknown, and where the line covers less than half of the window.
+    A mean gradient is NaN where gradients are unknown, and where the line covers less than half of the window.
     """
     different = np.concatenate([[True], np.diff(track.chainage_m) > 0.0])
     along, height = track.chainage_m[different], track.height_m[different]

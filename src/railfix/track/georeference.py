@@ -1,6 +1,6 @@
-"""Transformation of map coordinates to latitude and longitude in a modern frame, and accuracy of the transformation.
+"""Transformation of map coordinates to latitude and longitude in a modern frame, and its accuracy.
 
-An operation of PROJ (https://proj.org) is used only if its area of use contains the map and its grids are installed.
+A PROJ operation (https://proj.org) is used only if its area of use contains the map and its grids are installed.
 Ballpark operations, which do not change the datum, are not used.
 """
 
@@ -37,15 +37,15 @@ from railfix.track.crs import (
     rank_operation,
 )
 
-#: Projections of web and world maps; their scale differs so much from 1 that it is not checked.
+#: Projections of web and world maps. Their scale is not checked, because it differs greatly from 1.
 _UNEVEN: Final = (
     "Popular Visualisation Pseudo Mercator", "Mercator (variant A)", "Mercator (variant B)", "Equidistant Cylindrical",
 )  # fmt: skip
 #: Size of the cells for the choice of an operation; all maps in a cell are transformed by the same operation [deg].
 _CELL_DEG: Final = 0.25
-#: Accuracy of a transformation below which it is negligible compared with the accuracy of a map [m].
+#: Standard deviation below which a transformation error is negligible compared with the error of a map [m].
 NEGLIGIBLE_M: Final = 0.1
-#: An operation with a missing grid is reported as better if its accuracy is below this multiple of the accuracy of the
+#: An operation with a missing grid is reported as better if its accuracy is below this fraction of the accuracy of the
 #: operation that is used.
 _BETTER: Final = 0.9
 
@@ -57,7 +57,7 @@ class Georeference:
     latitude_deg: Floats  #: Latitude, shape (n,).
     longitude_deg: Floats  #: Longitude, shape (n,).
     frame: str = "EPSG:4979"  #: Geographic CRS of the coordinates.
-    operation: str = ""  #: Name of the PROJ operation that changed the datum; "" if the CRS is based on a modern frame.
+    operation: str = ""  #: Name of the PROJ operation that changed the datum; "" if the map is in a modern frame.
     accuracy_m: float = 0.0  #: Standard deviation in plan of the operation; NaN if unknown.
     notes: tuple[str, ...] = ()
 
@@ -79,7 +79,7 @@ class EllipsoidalHeights:
 
 
 def _box(latitude_deg: Floats, longitude_deg: Floats) -> Box:
-    """Return the bounds of points [deg]; across the date line, the east bound is more than 180."""
+    """Return the bounds of points [deg]; the east bound exceeds 180 if the points cross the date line."""
     west = float(longitude_deg.min())
     if float(longitude_deg.max()) - west > 180.0:
         longitude_deg = longitude_deg % 360.0
@@ -105,14 +105,14 @@ def georeference(crs: str, x: Floats, y: Floats, *, path: str) -> Georeference:
     crs : str
         Coordinate reference system of the map.
     x, y : ndarray, shape (n,)
-        Easting and northing, or longitude and latitude, in the units of the CRS; finite.
+        Easting and northing, or longitude and latitude, in the units of the CRS. All values must be finite.
     path : str
         Name of the file for error messages.
 
     Returns
     -------
     Georeference
-        Coordinates in a modern frame, with the operation that changed the datum and the accuracy of the operation.
+        Coordinates in a modern frame, and the name and accuracy of the operation that changed the datum.
 
     Raises
     ------
@@ -145,9 +145,9 @@ def georeference(crs: str, x: Floats, y: Floats, *, path: str) -> Georeference:
 
 
 def to_map(crs: str, place: Georeference, *, path: str) -> tuple[Floats, Floats]:
-    """Return the coordinates of positions in the CRS `crs` (inverse of `georeference`), shape (n,) each.
+    """Return the coordinates of positions in a CRS (inverse of `georeference`), shape (n,) each.
 
-    Modern frames are not distinguished, which causes errors of up to 2 m. Raise SettingsError if PROJ has no installed
+    Modern frames are treated as equal, which causes errors of up to 2 m. Raise SettingsError if PROJ has no installed
     operation for the positions.
     """
     if not find_crs(crs).is_bound and kind_of_frame(crs) != "older datum":
@@ -181,9 +181,7 @@ class _Chosen:
 
 @lru_cache(maxsize=256)
 def _choose_operation(crs: str, box: Box) -> _Chosen | str:
-    """Return the best operation from a CRS of an older datum to a modern frame in a box, or the reason why there is
-    none.
-    """
+    """Return the best operation from an older datum to a modern frame in a box, or why there is no operation."""
     source = find_crs(crs).to_2d()
     known = {code: find_operations(source, CRS.from_user_input(code).to_2d(), box) for code in _targets(crs, box)}
     datum = "its own datum" if source.is_bound else get_geodetic_frame(crs).name
@@ -218,8 +216,8 @@ def _choose_operation(crs: str, box: Box) -> _Chosen | str:
 
 
 def _targets(crs: str, box: Box) -> Iterable[str]:
-    """Return the modern frames that a map may be transformed to: the frames of its region, then WGS 84."""
-    if get_geodetic_frame(crs).name == TRANSIT:  # only frames with a known transformation to a realisation of the ITRF
+    """Return the modern frames to which a map may be transformed: the frames of its region, then WGS 84."""
+    if get_geodetic_frame(crs).name == TRANSIT:  # ITRF90, to which the transformation is known
         return ("EPSG:7902",)
     if find_crs(crs).is_bound:  # +towgs84
         return ("EPSG:4326",)
@@ -228,11 +226,10 @@ def _targets(crs: str, box: Box) -> Iterable[str]:
 
 
 def _accuracy(crs: str, usable: tuple[Transformer, ...], box: Box) -> float:
-    """Return the accuracy of the first operation [m], as stated by PROJ or implied by the other operations.
+    """Return the accuracy of the first operation [m]: the larger of PROJ's value and the value implied by the others.
 
-    If the results of the first operation and of another operation differ by more than the accuracy of the other
-    operation, the first operation may be wrong by the excess. The result is NaN if PROJ states no accuracy for the
-    first operation.
+    The first operation may be wrong by the difference of its result from another operation's result, minus the accuracy
+    of the other operation. The result is NaN if PROJ states no accuracy for the first operation.
     """
     stated = usable[0].accuracy if usable[0].accuracy >= 0.0 else np.nan
     conversion, unit, origin = _to_datum(crs)
@@ -247,7 +244,7 @@ def _accuracy(crs: str, usable: tuple[Transformer, ...], box: Box) -> float:
 
 
 def _check_area(crs: str, latitude_deg: Floats, longitude_deg: Floats, *, path: str) -> None:
-    """Raise InputFileError for points outside the area of use of the frame of a CRS.
+    """Raise InputFileError for points outside the area of use of a CRS's geodetic frame.
 
     The area of use of the projection is not checked, because projections are also used outside their areas.
     """
@@ -276,7 +273,7 @@ def _check_area(crs: str, latitude_deg: Floats, longitude_deg: Floats, *, path: 
 
 @lru_cache(maxsize=64)
 def _bounds(crs: str) -> Box:
-    """Return the bounds of the area of use of the frame of a CRS, with the margin; an empty box if there is no area."""
+    """Return the area of use of a CRS's geodetic frame, extended by the margin; an empty box if it has no area."""
     area = get_geodetic_frame(crs).area_of_use
     if area is None:
         return (np.inf, -np.inf, np.inf, -np.inf)
@@ -284,9 +281,9 @@ def _bounds(crs: str) -> Box:
 
 
 def _check_scale(crs: str, xy: Floats, latitude: Floats, longitude: Floats, *, path: str) -> None:
-    """Raise InputFileError if lengths in the grid and on the ground differ.
+    """Raise InputFileError if the line's lengths in the grid and on the ground differ.
 
-    A difference shows that the coordinates belong to another grid.
+    Different lengths show that the coordinates belong to another grid.
     """
     system = find_crs(crs)
     method = "" if system.coordinate_operation is None else system.coordinate_operation.method_name
@@ -306,9 +303,7 @@ def _check_scale(crs: str, xy: Floats, latitude: Floats, longitude: Floats, *, p
 
 @lru_cache(maxsize=32)
 def _to_datum(crs: str) -> tuple[Transformer, float, float]:
-    """Return the conversion of a CRS to latitude and longitude on its datum, with their angular unit and prime meridian
-    [deg].
-    """
+    """Return the conversion of a CRS to latitude and longitude on its datum, their unit and prime meridian [deg]."""
     system, datum = find_crs(crs), CRS.from_user_input(_find_frame(crs)).to_2d()
     plan = system.source_crs if system.is_bound and system.source_crs is not None else system
     meridian = datum.prime_meridian
@@ -318,7 +313,7 @@ def _to_datum(crs: str) -> tuple[Transformer, float, float]:
 
 
 def _in_degrees(crs: str, x: Floats, y: Floats) -> tuple[Floats, Floats]:
-    """Return the latitude and longitude on the datum of a CRS for coordinates in the CRS, shape (n,) each [deg]."""
+    """Convert coordinates in a CRS to latitude and longitude on the datum of the CRS, shape (n,) each [deg]."""
     conversion, unit, origin = _to_datum(crs)
     longitude, latitude = (np.asarray(v, np.float64) for v in conversion.transform(x, y))
     return (latitude, longitude) if (unit, origin) == (1.0, 0.0) else (latitude * unit, longitude * unit + origin)

@@ -1,4 +1,4 @@
-"""Heights for a map without heights, from a raster, a profile along the line, or the 3-D positions of a run."""
+"""Heights for a map without heights: from a raster, a profile along the line, or the 3-D positions of a run."""
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ RASTERS: Final = (
 HeightSource = FilePath | PositionLog  #: File with heights, or positions in memory.
 _SPACING_M: Final = 50.0  #: Largest spacing of points with heights [m].
 _WINDOW_CELLS: Final = 4_000_000  #: Largest number of raster cells that are read at once.
-_NEAR_M: Final = 15.0  #: Largest distance in plan between the line and a position that is used [m].
-#: Largest distance along the line between a point and the positions from which its height is computed [m].
+_NEAR_M: Final = 15.0  #: Positions farther than this from the line in plan are not used [m].
+#: Largest distance along the line of a point from the positions that determine its height [m].
 _REACH_M: Final = 200.0
 #: Standard deviation of the Gaussian weights along the line for RTK fixed positions [m].
 _KERNEL_M: Final = 15.0
-#: Standard deviation of the Gaussian weights along the line for single-point positions, which have errors that persist
-#: for hundreds of metres [m]. It causes an error of up to 5 m in a vertical curve of 2 km radius.
+#: Standard deviation of the Gaussian weights along the line for single-point positions, whose errors persist for
+#: hundreds of metres [m]. These weights cause a height error of about 5 m in a vertical curve of 2 km radius.
 _LARGEST_KERNEL_M: Final = 150.0
-#: Constants of the robust locally weighted regression (Cleveland 1979, doi:10.1080/01621459.1979.10481038): deviation
-#: beyond which a height has zero weight, in median deviations, and number of reweighting iterations.
+#: Constants of the robust locally weighted regression (Cleveland 1979, doi:10.1080/01621459.1979.10481038): limit of
+#: the deviation of a height, as a multiple of the median deviation, and number of reweighting iterations.
 _ROBUST, _WEIGHED_AGAIN = 6.0, 2
 
 
 def check_raster(path: FilePath, *, geoid: str | None, height_datum: str | None, sigma_m: float | None) -> None:
-    """Raise SettingsError if options for a raster are missing; the message names all of them.
+    """Raise SettingsError that names all missing options for a raster.
 
     Raise InputFileError if the raster cannot be read or has no CRS.
     """
@@ -72,7 +72,7 @@ def with_heights(
     height_datum: str | None = None,
     sigma_m: float | None = None,
 ) -> Track:
-    """Return the track with heights from a source, and with their standard deviation.
+    """Return the track with heights from `source`, and with the standard deviation of these heights.
 
     The source is a raster (`RASTERS`), a CSV table by chainage or kilometrage, or a position log. A raster requires
     `height_datum` and `sigma_m`. Points are added so that heights are at most 50 m apart. Raise InputFileError if the
@@ -92,7 +92,7 @@ def with_heights(
 
 
 def _dense(track: Track) -> Track:
-    """Return the track with points at most `_SPACING_M` apart, to have heights also between distant points."""
+    """Return the track with added points between points that are more than `_SPACING_M` apart."""
     pieces = np.ceil(np.diff(track.chainage_m) / _SPACING_M).astype(np.intp)
     if not (pieces > 1).any():
         return track
@@ -130,7 +130,7 @@ def _open_raster(path: FilePath) -> Iterator[tuple[Any, CRS]]:
 def _from_raster(
     track: Track, path: FilePath, *, geoid: str | None, height_datum: str | None, sigma_m: float | None
 ) -> Track:
-    """Return the track with the heights of a raster, interpolated linearly between the centres of cells."""
+    """Return the track with the heights of a raster, by linear interpolation between the centres of cells."""
     check_raster(path, geoid=geoid, height_datum=height_datum, sigma_m=sigma_m)
     with _open_raster(path) as (raster, crs):
         datum, model = own_height_datum(crs.to_wkt(), height_datum, geoid, path=str(path))
@@ -155,10 +155,9 @@ def _from_raster(
 
 
 def _sample(raster: Any, place: Floats) -> Floats:
-    """Interpolate a raster at rows and columns (2, n); the result has shape (n,), and is NaN where the raster has no
-    value.
+    """Interpolate a raster at rows and columns, shape (2, n); NaN where the raster has no value.
 
-    The raster is read in windows around successive points.
+    The raster is read in windows around successive points. The result has shape (n,).
     """
     from scipy.ndimage import map_coordinates
 
@@ -236,9 +235,7 @@ def _from_positions(track: Track, log: PositionLog, sigma_m: float | None, *, re
 
 
 def _smooth(target: Floats, place: Floats, height: Floats, sigma: Floats, *, reach_m: float) -> Floats:
-    """Return heights at the chainages `target`, smoothed by local straight lines; NaN farther than `reach_m` from
-    positions.
-    """
+    """Return heights at the chainages `target`, smoothed by local straight lines; NaN where no position is in reach."""
     kernel = float(np.clip(_KERNEL_M * np.median(sigma) / SIGMA_HEIGHT_M, _KERNEL_M, _LARGEST_KERNEL_M))
     weight = 1.0 / sigma**2
     for _ in range(_WEIGHED_AGAIN if kernel > _KERNEL_M else 0):
@@ -273,7 +270,7 @@ def _local_lines(target: Floats, place: Floats, height: Floats, weight: Floats, 
 
 
 def _place(track: Track) -> Georeference:
-    """Return the points of a track in plan as a georeference."""
+    """Return the georeference of a track's points."""
     return Georeference(
         latitude_deg=track.latitude_deg, longitude_deg=track.longitude_deg, frame=track.provenance.frame
     )

@@ -21,8 +21,8 @@ from railfix.track.crs import find_operations, get_vertical_datum, known_accurac
 from railfix.track.georeference import NEGLIGIBLE_M, EllipsoidalHeights, Georeference
 from railfix.track.route import MapReading
 
-#: Geoid models of Japan (GSI) by the names that users give: GSIGEO2011 for heights levelled before April 2025,
-#: JPGEO2024 for later heights.
+#: Geoid models of Japan (GSI) by name in options: GSIGEO2011 for heights levelled before April 2025, JPGEO2024 for
+#: later heights.
 JAPAN_MODELS: Final = {
     "japan": "JPGEO2024",
     "jpgeo2024": "JPGEO2024",
@@ -34,7 +34,7 @@ _LOADERS: Final = {
     "JPGEO2024+Hrefconv2024": japan_geoid.load_embedded_jpgeo2024_hrefconv2024,
     "GSIGEO2011": japan_geoid.load_embedded_gsigeo2011,
 }
-#: Standard deviation of the Japanese models [m], which the GSI states from a comparison of GNSS with levelling.
+#: Standard deviation of the Japanese models [m], as stated by the GSI from a comparison of GNSS with levelling.
 _JAPAN_M: Final = 0.02
 GEOIDS: Final = "egm96 of the world, japan, a grid file, or a vertical CRS such as EPSG:3855"  #: Accepted geoids.
 #: End of messages on orthometric heights without a geoid.
@@ -55,7 +55,7 @@ class GeoidModel:
 
 
 def check_height_datum(height_datum: str | None) -> None:
-    """Raise SettingsError if a height datum is given that is neither "ellipsoidal" nor "orthometric"."""
+    """Raise SettingsError unless a height datum is None, "ellipsoidal" or "orthometric"."""
     if height_datum is not None and height_datum not in HEIGHT_DATUMS:
         raise SettingsError(f"height_datum {height_datum!r} is unknown; expected 'ellipsoidal' or 'orthometric'")
 
@@ -94,27 +94,26 @@ def geoid_heights(geoid: str | CRS, place: Georeference, *, path: str) -> GeoidM
 def egm96_heights(latitude_deg: Floats, longitude_deg: Floats) -> Floats:
     """Compute the heights of the geoid EGM96 above the WGS 84 ellipsoid, shape (n,) [m].
 
-    The heights are interpolated by a cubic spline in the 15' grid (NGA, WW15MGH), within 5 mm of the published test
-    values.
+    A cubic spline interpolates the 15' grid (NGA, WW15MGH). The results are within 5 mm of the published test values.
     """
     place = (90.0 - latitude_deg) * 4.0, (longitude_deg % 360.0) * 4.0 + _WRAP
     return np.asarray(scipy.ndimage.map_coordinates(_egm96_spline(), place, order=3, prefilter=False, mode="nearest"))
 
 
-#: Number of columns of the grid that are repeated at each side, so that the spline is periodic in longitude.
+#: Number of grid columns that are repeated at each side, so that the spline is periodic in longitude.
 _WRAP: Final = 16
 
 
 @lru_cache(maxsize=1)
 def _egm96_spline() -> Floats:
-    """Return the spline coefficients of the EGM96 grid, which is stored as differences along both axes [cm]."""
+    """Return the spline coefficients of the EGM96 grid [m], which is stored as differences along both axes [cm]."""
     with (files("railfix.track") / "egm96_15.npz").open("rb") as file, np.load(file) as data:
         heights = data["second_differences_cm"].astype(np.int64).cumsum(axis=0).cumsum(axis=1) / 100.0
     return read_only(scipy.ndimage.spline_filter(np.pad(heights, ((0, 0), (_WRAP, _WRAP)), mode="wrap"), order=3))
 
 
 def _model_of_proj(geoid: str | CRS, place: Georeference) -> GeoidModel:
-    """Compute geoid heights with PROJ, from a grid file or by the operation from a height datum to the ellipsoid.
+    """Compute geoid heights with PROJ from a grid file, or by the operation from a height datum to the ellipsoid.
 
     Raise SettingsError if the geoid is unknown or has no height datum, or if the grid is not installed.
     """
@@ -179,9 +178,9 @@ def heights_of_file(
 ) -> EllipsoidalHeights:
     """Convert the heights of a file to ellipsoidal heights.
 
-    `datum`, `geoid` and `geoid_m` are stated in the file. The datum and the geoid in `reading` are given by the user;
-    they take precedence. Raise InputFileError if the file names an unknown datum, and SettingsError if no datum is
-    known or if two datums contradict each other.
+    `datum`, `geoid` and `geoid_m` are from the file. The user's datum and geoid in `reading` take precedence. Raise
+    InputFileError if the file names an unknown datum. Raise SettingsError if there is no datum or two datums contradict
+    each other.
     """
     check_height_datum(reading.height_datum)
     if datum is not None and datum not in HEIGHT_DATUMS:
@@ -197,7 +196,7 @@ def heights_of_file(
     if used == "ellipsoidal":
         geoid_m = None
     elif geoid_m is not None and not isinstance(model, str):
-        model = None  # `geoid_m` of the map replaces the model of the compound CRS
+        model = None  # the map's `geoid_m` replaces the geoid of the compound CRS
     elif model is None:
         model = geoid
     return ellipsoidal_heights(heights_m, place, datum=used, geoid=model, geoid_m=geoid_m, path=path)
@@ -206,9 +205,9 @@ def heights_of_file(
 def own_height_datum(
     crs: str | None, height_datum: str | None, geoid: str | None, *, path: str
 ) -> tuple[str | None, str | CRS | None]:
-    """Return the height datum and geoid, as given by the user or by a compound CRS; None if neither gives them.
+    """Return the height datum and the geoid of the user or of a compound CRS; None if neither states them.
 
-    Raise SettingsError if user and CRS contradict each other.
+    Raise SettingsError if the two contradict each other.
     """
     vertical = get_vertical_datum(crs)
     if vertical is None:
@@ -226,7 +225,7 @@ def own_height_datum(
 
 
 def _is_geoid_of(geoid: str, vertical: CRS) -> bool:
-    """Return whether a geoid belongs to a height datum; True for a grid file, which is not checked."""
+    """Return whether a geoid belongs to a height datum; grid files are not checked, and the result is True."""
     key = geoid.strip().lower()
     if key in JAPAN_MODELS:
         return vertical.name.startswith(("JGD", "JSLD"))
@@ -249,7 +248,7 @@ def ellipsoidal_heights(
     path: str,
     geoid_m: Floats | None = None,
 ) -> EllipsoidalHeights:
-    """Convert heights to ellipsoidal heights, by a geoid model or the geoid heights `geoid_m` of the map.
+    """Convert heights to ellipsoidal heights, by a geoid model or the map's geoid heights `geoid_m`.
 
     Raise SettingsError for contradictory options, and InputFileError for orthometric heights without a geoid.
     """

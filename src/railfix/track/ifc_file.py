@@ -39,7 +39,7 @@ _LAWS: Final = {
 _ARCS: Final = {
     "CONSTANTGRADIENT": "parabola", "PARABOLICARC": "parabola", "CIRCULARARC": "circle", "CLOTHOID": "clothoid",
 }  # fmt: skip
-#: Another form of the cubic parabola is used if it reduces the distance to the next element by more than this [m].
+#: Another form of the cubic parabola is used if it reduces the gap to the next element by more than this value [m].
 _SIMILAR_M: Final = 1e-3
 _TOKEN: Final = re.compile(r"'(?:[^']|'')*'|#\d+|\.[A-Z0-9_]+\.|[A-Z][A-Z0-9_]*|[-+]?\d[\d.]*(?:E[-+]?\d+)?|[(),$*]")
 _PREFIX: Final = {"None": 1.0, "MILLI": 1e-3, "CENTI": 1e-2, "DECI": 0.1, "DECA": 10.0, "HECTO": 100.0, "KILO": 1e3}
@@ -61,7 +61,7 @@ class _Placement:
     turn_rad: float = 0.0
 
     def then(self, x: float, y: float, z: float, turn: float) -> _Placement:
-        """Return the placement of axes that are given relative to this placement."""
+        """Return the placement of axes whose position and direction are relative to this placement."""
         cosine, sine = np.cos(self.turn_rad), np.sin(self.turn_rad)
         return _Placement(
             float(self.x_m + cosine * x - sine * y),
@@ -220,7 +220,7 @@ def _map_conversion(
 
 
 def _place(step: _Step, alignment: _Entity, layout: _Entity, scale: float) -> _Placement:
-    """Return the placement of an alignment, or of the horizontal layout if the layout is placed relative to the
+    """Return the placement of an alignment, or of its horizontal layout if that has a placement relative to the
     alignment.
     """
     own, relative = alignment.values[5], layout.values[5]
@@ -244,7 +244,7 @@ def _place(step: _Step, alignment: _Entity, layout: _Entity, scale: float) -> _P
 
 
 def _chain(step: _Step, reference: Any) -> list[Any]:
-    """Return the references of the placements from an object up to the project.
+    """Return the references of successive placements, from an object to the project.
 
     Raise InputFileError if a placement is not local.
     """
@@ -285,7 +285,7 @@ def _with_cubics(plan: list[PlanElement], *, path: str, name: str) -> list[Plan]
 
 
 def _with_bends(profile: list[ProfileElement]) -> list[ProfileElement]:
-    """Return the elements of a profile; a clothoid starts with the curvature at the end of the previous element."""
+    """Return the elements of a profile, with the start curvature of clothoids taken from the previous element's end."""
     result: list[ProfileElement] = []
     bend = 0.0
     for element in profile:
@@ -300,7 +300,7 @@ def _with_bends(profile: list[ProfileElement]) -> list[ProfileElement]:
 
 
 def _move(plan: list[Plan], profile: list[ProfileElement], at: _Placement) -> tuple[list[Plan], list[ProfileElement]]:
-    """Return the elements transformed from the placement of the alignment to the coordinates of the project."""
+    """Transform elements from the alignment's placement to the coordinates of the project."""
     moved = []
     for element in plan:
         placed = at.then(element.x_m, element.y_m, 0.0, element.direction_rad)
@@ -336,9 +336,9 @@ def _plan(step: _Step, entity: _Entity, scale: float, angle: float) -> PlanEleme
 
 
 def _leaning(plan: list[PlanElement], leans: list[float], cant: list[CantElement]) -> list[PlanElement]:
-    """Return the elements in plan, with `lean_m` of each Viennese bend computed from the change of cant over the bend.
+    """Compute `lean_m` of each Viennese bend from the change of cant over the bend, and return the elements in plan.
 
-    `leans` has, for each element, the height of the centre of gravity divided by the gauge.
+    `leans` are the heights of the centre of gravity divided by the gauge, for each element.
     """
     result = []
     for element, lean, start in zip(plan, leans, plan_starts(plan), strict=True):

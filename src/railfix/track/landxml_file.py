@@ -32,13 +32,13 @@ _UNITS: Final = {
     "inch": 0.0254,
     "mile": 1609.344,
 }
-#: Transition curves defined by their offsets from the tangent (`railfix.track.transitions`). All cubic types, with and
-#: without the Japanese correction, are treated equally, because the `End` point of a spiral determines the offset.
+#: Transition curves defined by offsets from the tangent (`railfix.track.transitions`). Cubic types with and without the
+#: Japanese correction are read alike, because the `End` point of a spiral determines the offset.
 _ORDINATES: Final[dict[str, Shape]] = {
     "cubic": "cubic", "cubicParabola": "cubic", "japaneseCubic": "cubic", "sineHalfWave": "half-sine",
 }  # fmt: skip
-#: Laws of curvature of the other spirals. The biquadratic parabola (InfraModel, Finland) is Helmert's curve, the
-#: curvature of which consists of two parabolas.
+#: Curvature laws of the other spirals. The biquadratic parabola (InfraModel, Finland) is Helmert's curve, whose
+#: curvature consists of two parabolas.
 _SPIRALS: Final = {
     "clothoid": "linear",
     "bloss": "bloss",
@@ -47,11 +47,10 @@ _SPIRALS: Final = {
     "biquadraticParabola": "helmert",
 }
 _CANT_LAWS: Final = {**_SPIRALS, **dict.fromkeys(_ORDINATES, "linear"), "sineHalfWave": "cosine"}
-_SAME_M: Final = 1e-6  #: Length below which an element has no direction and is left out [m].
+_SAME_M: Final = 1e-6  #: Shorter elements are left out, because they have no direction [m].
 #: Half length of the interval within which the kilometrage jumps at a station equation [m].
 _JUMP_M: Final = 0.05
-#: Smallest and largest accepted ratio of the curvature at the end of a transition to the reciprocal of the stated
-#: radius.
+#: Smallest and largest accepted ratio of the curvature at a transition's curved end to 1 / stated radius.
 _ORDINATE_SHARE: Final = (0.9, 1.25)
 _BROKEN_RAD: Final = 0.1  #: Change of direction at a joint that indicates a wrong order of coordinates [rad].
 
@@ -65,7 +64,7 @@ def finite_number(text: Any) -> float:
 
 
 def read_landxml_segments(path: str, root: Any, reading: MapReading) -> list[Segment]:
-    """Read the alignments of a LandXML file, given its root element, as segments.
+    """Read the alignments of a LandXML file as segments; `root` is the root element of the file.
 
     Raise InputFileError if there is no alignment, or an element is not valid or not supported.
     """
@@ -130,7 +129,7 @@ def _elements(parent: Any) -> list[Any]:
 
 
 def _read_stations(path: str, alignment: Any, scale: float, start: float) -> Stations:
-    """Return the stations of an alignment, from the station of its start and the station equations.
+    """Return the stations of an alignment; `start` is the station of its first point [m].
 
     Raise InputFileError if the station equations are not in the order of the line.
     """
@@ -157,11 +156,11 @@ def _point(element: Any, name: str, scale: float, easting_first: bool) -> np.nda
 
 
 def _read_plans(path: str, elements: list[Any], scale: float, crs: str | None) -> tuple[list[Plan], tuple[str, ...]]:
-    """Return the elements in plan, and a note if the file has easting before northing, against LandXML 1.2.
+    """Return the elements in plan, and a note if the file has easting first, which LandXML 1.2 does not allow.
 
-    Of the two orders of coordinates, the order is used in which the coordinates lie in the area of the CRS. If they do
-    so in both orders or in neither, the order with fewer breaks of direction between elements is used. Raise
-    InputFileError if the two criteria contradict each other.
+    The chosen order is the one in which the coordinates are in the area of the CRS. If this is true of both orders or
+    of none, the order with fewer breaks of direction between elements is chosen. Raise InputFileError if the two
+    criteria contradict each other.
     """
     plans, broken, inside = [], [], []
     for easting_first in (False, True):
@@ -175,8 +174,8 @@ def _read_plans(path: str, elements: list[Any], scale: float, crs: str | None) -
             orders = ("northing first", "easting first")
             raise InputFileError(
                 path,
-                f"with {orders[chosen]} the coordinates lie in the area of {crs}, but curves turn to the side opposite "
-                f"to their attribute rot; with {orders[1 - chosen]} it is the other way round; correct the order",
+                f"with {orders[chosen]}, the coordinates are in the area of {crs}, but curves do not match "
+                f"their attribute rot; with {orders[1 - chosen]}, the coordinates are outside it; correct the order",
             )
     else:
         chosen = int(broken[1] < broken[0])
@@ -185,7 +184,7 @@ def _read_plans(path: str, elements: list[Any], scale: float, crs: str | None) -
 
 
 def _turn_at(before: Plan, after: Plan) -> float:
-    """Return the change of direction from the end of one element to the start of the next [rad]."""
+    """Return the change of direction between the end of an element and the start of the next element [rad]."""
     ends = before.place_at(before.length_m - np.array([0.0, min(0.01, before.length_m / 2.0)]))
     direction = np.arctan2(*(ends[0] - ends[1])[::-1])
     return float(abs((after.direction_rad - direction + np.pi) % (2.0 * np.pi) - np.pi))
@@ -214,11 +213,12 @@ def _read_plan(path: str, element: Any, scale: float, easting_first: bool) -> Pl
         middle = _point(element, "PI", scale, easting_first)
         texts = [element.get(k) for k in ("radiusStart", "radiusEnd")]
         radii = [0.0 if text == "INF" else finite_number(text) * scale for text in texts]
-        first, last = (side / radius if radius else 0.0 for radius in radii)  # some programs write 0 for a straight end
+        # some programs write the radius 0 at a straight end
+        first, last = (side / radius if radius else 0.0 for radius in radii)
         if element.get("spiType") in _ORDINATES:
             return _read_ordinates(path, _ORDINATES[element.get("spiType")], (start, middle, end), (first, last))
         length, law = finite_number(element.get("length")) * scale, _SPIRALS[element.get("spiType")]
-        if last == 0.0:  # use the tangent at the straight end; every law turns by half of curvature times length
+        if last == 0.0:  # use the tangent at the straight end; the turn is curvature * length / 2 for all laws
             direction = np.arctan2(*(end - middle)[::-1]) - first * length / 2.0
         else:
             direction = np.arctan2(*(middle - start)[::-1])
@@ -276,9 +276,9 @@ def _read_ordinates(
 
 
 def _read_profile(path: str, profile: Any, scale: float, start: float) -> list[ProfileElement]:
-    """Return the elements of a profile, from its points of vertical intersection (PVI) and the curves at these points.
+    """Return the profile elements: gradients between points of vertical intersection (PVI), and curves at these points.
 
-    The list is empty without a profile. Raise InputFileError if stations do not rise or a type is not supported.
+    The list is empty without a profile. Raise InputFileError if the stations do not rise or a type is not supported.
     """
     if profile is None:
         return []
@@ -326,8 +326,8 @@ def _read_cant(cant: Any, scale: float, start: float) -> tuple[list[CantElement]
     """Return the cant elements between successive cant stations, and notes.
 
     The outer rail is raised unless the file states another rotation point. Cant is in millimetres, or in inches if
-    lengths are imperial (LandXML 1.2). If all values are below 1, the values are assumed to be in the unit of length of
-    the file, as in InfraModel, with a note.
+    lengths are imperial (LandXML 1.2). If all values are below 1, a note states that they are assumed to be in the
+    length unit of the file, as in InfraModel.
     """
     if cant is None:
         return [], ()
@@ -339,11 +339,11 @@ def _read_cant(cant: Any, scale: float, start: float) -> tuple[list[CantElement]
     if 0.0 < np.abs(applied).max(initial=0.0) < 1.0:
         unit = scale
         notes = (
-            f"cant: at most {np.abs(applied).max():g} in the file; assumed in its unit of length, not in millimetres",
+            f"cant: at most {np.abs(applied).max():g}, assumed in the length unit of the file, not in millimetres",
         )
     stations, laws = [], []
     for element, value in zip(found, applied * unit, strict=True):
-        # in a clockwise curve, to the right, the left rail is the outer rail
+        # in a clockwise curve, which turns to the right, the left rail is the outer rail
         outer, inner = value * (1.0 - lowered), -value * lowered
         rails = (outer, inner) if element.get("curvature") == "cw" else (inner, outer)
         stations.append((finite_number(element.get("station")) * scale - start, rails))

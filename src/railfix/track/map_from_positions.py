@@ -22,21 +22,21 @@ from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Provenance, Track
 
 #: Note in every map made from positions.
 ANTENNA_PATH = "the track was made from positions of an antenna: it is that antenna's path, not the centreline"
-_TURN: Final = -0.5  #: Cosine of the change of direction beyond which the path counts as reversed (120 degrees).
-#: First limit of the distance between a position and the straight line between its neighbours [m]. An outlier exceeds
-#: this limit and the two following limits.
+_TURN: Final = -0.5  #: Cosine of 120 degrees, the change of direction beyond which the path counts as reversed.
+#: First limit of a position's distance from the straight line between its neighbours [m]. An outlier exceeds three
+#: limits: this one and the two that follow.
 _BESIDE_M: Final = 5.0
-_BESIDE_MEDIANS: Final = 6.0  #: Second limit, as a multiple of the median distance.
-#: Radius [m]; the third limit is the middle ordinate of a curve with this radius between the neighbours.
+_BESIDE_MEDIANS: Final = 6.0  #: Second limit, as a multiple of the median of these distances.
+#: Third limit: the middle ordinate of a curve with this radius between the neighbours [m].
 _LEAST_RADIUS_M: Final = 150.0
-_ROUNDS: Final = 20  #: Largest number of searches for outliers; each search leaves out the outliers found before.
-_ENOUGH: Final = 10  #: Minimum number of positions for a search.
-#: Largest acceleration of the train; the deviation along the line that it explains is subtracted.
+_ROUNDS: Final = 20  #: Largest number of searches for outliers. Each search leaves out the outliers found before.
+_ENOUGH: Final = 10  #: Minimum number of positions for a search for outliers.
+#: Largest acceleration of the train. The deviation along the line that it can cause is not counted.
 _ACCELERATION_MPS2: Final = 2.0
-#: The path between the neighbours of a position counts as straight if both neighbours are within this time [s].
+#: The path between the neighbours of a position counts as straight if both are at most this time away [s].
 _NEAR_S: Final = 2.5
-#: The path also counts as straight if its directions before and after the position are parallel to the line between the
-#: neighbours. The value is the smallest cosine of the angles between these directions and the line.
+#: The path also counts as straight if its directions before and after the position are nearly parallel to the line
+#: between the neighbours. The value is the smallest accepted cosine of the angles to this line.
 _STRAIGHT: Final = 0.87
 #: Half length of the window over which the displacement is computed to detect standstill [s].
 _STANDING_WINDOW_S: Final = 3.0
@@ -47,16 +47,17 @@ class ThinningLimits(Settings):
 
     spacing_m: float = Field(default=5.0, gt=0)  #: Smallest distance between consecutive points.
     #: Largest deviation of positions from the chord between two points (P1 4.1(3): 0.30 m). If the deviation is larger,
-    #: the farthest position also becomes a point. Times are required, to distinguish a bend from noise at standstill.
+    #: the farthest position also becomes a point. This limit requires times, to distinguish a bend from noise at
+    #: standstill.
     chord_m: float = Field(default=0.30, gt=0)
-    #: Horizontal speed below which the antenna is stationary, so that changes of position are noise or drift. Positions
-    #: at standstill are dropped. Times are required. With 0, all positions are kept.
+    #: Horizontal speed below which the antenna counts as stationary. Positions at standstill are dropped, because their
+    #: changes are noise or drift. This limit requires times. With 0, all positions are kept.
     standing_mps: float = Field(default=0.2, ge=0)
-    #: Distance between consecutive points above which a gap is reported.
+    #: Distance between consecutive points above which they are reported as a gap.
     jump_m: float = Field(default=50.0, gt=0)
     gap_m: float = Field(default=2000.0, gt=0)  #: Longest gap that is bridged; a longer gap is an error.
-    #: Largest speed of the vehicle. Positions that can be reached only at a higher speed are dropped. Without times,
-    #: positions are dropped that are farther than `gap_m` from the positions before and after them.
+    #: Largest speed of the vehicle. Positions that can be reached only at a higher speed are dropped. If times are
+    #: unknown, positions farther than `gap_m` from the adjacent positions are dropped instead.
     speed_mps: float = Field(default=150.0, gt=0)
 
 
@@ -66,18 +67,18 @@ class Thinned:
 
     kept: Indices  #: Rows of the positions that became points of the map, in ascending order, shape (V,).
     dropped: dict[str, int]  #: Number of dropped rows by reason.
-    jumps: Indices  #: Indices of the points before a gap of more than `ThinningLimits.jump_m`, shape (j,).
+    jumps: Indices  #: Indices of points before a gap that exceeds `ThinningLimits.jump_m`, shape (j,).
     jump_m: Floats  #: Length of the gap after each of these points, shape (j,).
-    #: Indices of the points at which the path turns by more than 120 degrees, because of a reversal or a wrong
-    #: position, shape (t,).
+    #: Indices of points at which the path turns by more than 120 degrees, shape (t,). The cause is a reversal or a
+    #: wrong position.
     turns: Indices
 
 
 def stationary(time: Datetimes, ecef_m: Floats, *, speed_mps: float, window_s: float) -> Masks:
     """Return a mask of the rows at which the antenna is stationary, shape (T,).
 
-    A row is stationary if the horizontal displacement over a window of `window_s` on both sides is less than
-    `speed_mps` times the duration of the window. Times must rise; without times (NaT) no row is stationary.
+    A row is stationary if the horizontal displacement within `window_s` before and after it is less than `speed_mps`
+    times the duration. Times must rise. If a time is NaT, no row is stationary.
     """
     if len(time) < 3 or np.isnat(time).any() or speed_mps == 0.0:
         return np.zeros(len(time), dtype=np.bool_)
@@ -86,7 +87,7 @@ def stationary(time: Datetimes, ecef_m: Floats, *, speed_mps: float, window_s: f
     last = np.searchsorted(t, t + window_s + 1e-6, side="right") - 1
     moved = np.einsum("tij,tj->ti", axes_at(ecef_m), ecef_m[last] - ecef_m[first])
     distance = np.hypot(moved[:, 0], moved[:, 1])
-    # at least half of the window must have data
+    # the data must cover at least half of the window
     known = t[last] - t[first] >= window_s
     return np.asarray(known & (distance < speed_mps * (t[last] - t[first])))
 
@@ -96,8 +97,8 @@ def thin(
 ) -> Thinned:
     """Select the positions, shape (n, 3) ECEF [m], that become points of a map.
 
-    Rows are dropped first if they are NaN, not `usable`, out of reach, an outlier, or stationary. Noise and drift at
-    standstill therefore cause no loops. The points are at least `ThinningLimits.spacing_m` apart, except in bends
+    First, rows are dropped that are NaN, not `usable`, out of reach, outliers, or stationary, so that noise and drift
+    at standstill cause no loops. The selected points are at least `ThinningLimits.spacing_m` apart, except in bends
     (`ThinningLimits.chord_m`). The last position is also kept if it is at least a fifth of the spacing ahead.
     """
     limits = limits or ThinningLimits()
@@ -138,7 +139,7 @@ def thin(
 
 
 def _reachable(time: Datetimes, ecef_m: Floats, limits: ThinningLimits) -> Masks:
-    """Return a mask of the rows that one vehicle can have reached in succession, shape (n,).
+    """Return a mask of the rows that one vehicle can reach in succession, shape (n,).
 
     The search starts from the longest part without a jump, and continues towards both ends of the log.
     """
@@ -206,9 +207,8 @@ def _outliers(time: Datetimes, ecef_m: Floats) -> Masks:
 def _goes_on(points: Floats, direction: Floats) -> Masks:
     """Return a mask of the inner points at which the path is straight, given the `direction` between both neighbours.
 
-    Before a point, the step to the previous neighbour must have this direction, either from the point before this
-    neighbour or from the point before that. After the point, the same applies to the steps from the next neighbour. One
-    of the two steps may differ, because a position may be an outlier.
+    On each side of a point, two steps end at its neighbour: from the next point and from the second next point. At
+    least one of the two steps must have this direction; the other step may differ, because its point may be an outlier.
     """
     cosine = np.full((2, 2, len(direction)), -1.0)
     for span in (1, 2):
@@ -222,9 +222,7 @@ def _goes_on(points: Floats, direction: Floats) -> Masks:
 
 
 def _with_short_moves(points: Floats, stands: Masks, spacing_m: float) -> Masks:
-    """Return the mask of stationary rows, extended by the movements between standstills that are shorter than the
-    spacing.
-    """
+    """Extend the mask of stationary rows by movements between standstills that are shorter than the spacing."""
     if not stands.any():
         return stands
     edges = np.flatnonzero(np.diff(stands)) + 1
@@ -261,7 +259,7 @@ def _at_spacing(points: Floats, spacing_m: float) -> Indices:
 
 
 def _with_bends(points: Floats, chosen: Indices, chord_m: float) -> Indices:
-    """Return the chosen points and, for each chord with a deviation above `chord_m`, the point farthest from it."""
+    """Return the chosen points, and the farthest point from each chord with a deviation above `chord_m`."""
     if len(chosen) < 2:
         return chosen
     piece = np.searchsorted(chosen, np.arange(len(points)), side="right") - 1
@@ -292,9 +290,9 @@ def from_positions(
 ) -> Track:
     """Create a track from positions, shape (n, 3) ECEF [m], in the order of travel.
 
-    The positions are selected by `thin`. `time` is NaT where unknown; `usable` is a mask of the rows that may be used;
+    The positions are selected by `thin`. Unknown times are NaT. `usable` is a mask of the rows that may be used.
     `spacing_m` is ignored if `limits` are given. The notes of the track report gaps and reversals, and that the track
-    is the path of the antenna. Raise ValueError if fewer than two points are left, or a gap is too long.
+    is the path of the antenna. Raise ValueError if fewer than two points remain, or a gap is too long.
     """
     thinned = thin(time, ecef_m, usable=usable, limits=limits or ThinningLimits(spacing_m=spacing_m))
     return create_track(ecef_m, thinned, name=name, sigma_plan_m=sigma_plan_m, sigma_height_m=sigma_height_m)
@@ -313,7 +311,7 @@ def create_track(
 ) -> Track:
     """Create a track from the positions selected by `thin`.
 
-    Raise ValueError if fewer than two points are left, or a gap is longer than `gap_m`.
+    Raise ValueError if fewer than two points remain, or a gap is longer than `gap_m`.
     """
     if len(thinned.kept) < 2:
         dropped = ", ".join(f"{count} {reason}" for reason, count in thinned.dropped.items() if count)
@@ -345,10 +343,11 @@ def create_track(
 
 
 def usable_rows(log: PositionLog, *, quality: Sequence[int] | None = None, max_sigma_m: float | None = None) -> Masks:
-    """Return a mask of the rows of a log within the limits of quality and standard deviation.
+    """Return a mask of the rows of a log with an accepted quality number and standard deviation.
 
-    By default RTK fixed positions (quality 1) are used, or all positions of a log without a quality column. Raise
-    InputFileError if the log lacks the column of a limit, and NoPositionError if no position has an accepted quality.
+    By default, RTK fixed positions (quality 1) are used. If the log has no quality column, all positions are used.
+    Raise InputFileError if the log lacks the column for a given limit, and NoPositionError if no position has an
+    accepted quality.
     """
     usable = np.ones(len(log), dtype=np.bool_)
     if quality is not None and not log.has_quality:
@@ -379,7 +378,7 @@ SIGMA_OF_QUALITY: Final[Mapping[int, tuple[float, float]]] = MappingProxyType(
 def _accuracy(log: PositionLog, kept: Indices) -> tuple[float, float, str]:
     """Return the standard deviations of a map in plan and height [m], and a note on how they were obtained.
 
-    Each is the largest of the value stated in the log, the value for the quality number, and the value of P1.
+    Each standard deviation is the largest of three values: stated in the log, for the quality number, and from P1.
     """
     plan, height = SIGMA_PLAN_M, SIGMA_HEIGHT_M
     stated = log.sigma_m[kept]
@@ -405,10 +404,10 @@ def from_position_log(
     limits: ThinningLimits | None = None,
     name: str | None = None,
 ) -> tuple[Track, Thinned]:
-    """Create a track from the accurate positions of a log; return the track and the selection of rows.
+    """Create a track from the accurate positions of a log, and return the track and the selection of rows.
 
-    Raise NoPositionError if fewer than two points are left. Raise InputFileError if times decrease, the log lacks the
-    column of a limit, or a gap is too long.
+    Raise NoPositionError if fewer than two points remain. Raise InputFileError if times decrease, the log lacks the
+    column for a given limit, or a gap is too long.
     """
     limits = limits or ThinningLimits(spacing_m=spacing_m)
     usable = usable_rows(log, quality=quality, max_sigma_m=max_sigma_m)

@@ -3,7 +3,7 @@
 The tables are described at https://github.com/EGNSS-MATE/egnss-mate-schematics. A circle is given by its centre and the
 arc length from its northernmost point. A clothoid is given by its point of zero curvature, the azimuth at this point
 and the arc length from this point. The tables define neither the sign of curves nor the constant of a clothoid.
-Therefore, the interpretation is used in which the segments of an edge meet each other.
+Therefore, the reader interprets both such that successive segments of an edge meet.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def read_edges(path: Path, reading: MapReading) -> list[Segment]:
 def _segment_of_points(path: Path, edge: str, rows: pl.DataFrame, reading: MapReading) -> Segment:
     """Create a segment from the points of one track edge.
 
-    The table has cant in millimetres; a missing or zero radius is straight track.
+    The cant in the table is in millimetres. A missing or zero radius is straight track.
     """
     values = {name: rows[name].cast(pl.Float64).fill_null(np.nan).to_numpy() for name in _NUMBERS}
     for name in _NUMBERS[:3]:
@@ -75,13 +75,13 @@ _POSITION: Final = "S_DM_TRACK_SEGMENT_POSITION"
 _GRADIENT: Final = "S_DM_TRACK_SEGMENT_GRADIENT"
 _CANT: Final = "S_DM_TRACK_SEGMENT_CANT"
 _SPAN: Final = ("TRACK_SEGMENT_REFERENCE_POSITION", "TRACK_SEGMENT_LENGTH")
-#: Largest accepted gap between two successive segments of an edge [m], as computed by `_gap`.
+#: Largest accepted gap between two successive segments of an edge, as computed by `_gap` [m].
 _MEETS_M: Final = 0.5
 Row = dict[str, str]
 
 
 def _read_segments(path: FilePath, reading: MapReading) -> list[Segment]:
-    """Read edges from S_DM_TRACK_SEGMENT_POSITION, and from the tables of gradient and cant in the same folder.
+    """Read edges from S_DM_TRACK_SEGMENT_POSITION, and from the gradient and cant tables in the same folder.
 
     Raise InputFileError if the segments of an edge do not meet.
     """
@@ -101,8 +101,8 @@ def _read_segments(path: FilePath, reading: MapReading) -> list[Segment]:
 def _rows(path: FilePath, table: str | None) -> dict[str, list[Row]]:
     """Return the rows of each edge, sorted by distance from the start of the edge.
 
-    The rows are from the file, or from another `table` in the same folder. If the other table is missing, the result is
-    empty.
+    If `table` is None, the rows are from the file `path`, otherwise from the file of this table in the same folder. The
+    result is empty if that file is missing.
     """
     file = Path(path)
     if table is not None:
@@ -139,7 +139,7 @@ def _find_crs(cell: str) -> str | None:
 
 
 def _plan(path: str, edge: str, rows: Sequence[Row]) -> list[PlanElement]:
-    """Return the elements of an edge, in the interpretations that meet best; raise InputFileError if there is a gap."""
+    """Return the elements of an edge, interpreted such that they meet best; raise InputFileError if a gap remains."""
     forms = [_forms(path, row) for row in rows]
     gaps = (np.array([[_gap(a, b) for a in before] for b in after]) for before, after in pairwise(forms))
     chosen = cheapest_path([np.zeros(len(options)) for options in forms], gaps)
@@ -158,7 +158,7 @@ def _end(element: PlanElement) -> tuple[np.ndarray, float]:
 
 
 def _gap(before: PlanElement, after: PlanElement) -> float:
-    """Return the distance between the end of an element and the start of the next, plus 10 m per rad of turn [m]."""
+    """Return the distance from an element's end to the next element's start, plus 10 m per rad of turn [m]."""
     place, direction = _end(before)
     turn = np.angle(np.exp(1j * (direction - after.direction_rad)))
     return float(np.hypot(*(place - (after.x_m, after.y_m))) + 10.0 * abs(turn))
@@ -195,9 +195,7 @@ def _forms(path: str, row: Row) -> list[PlanElement]:
 
 
 def _element(x: float, y: float, azimuth: float, first: float, last: float, length: float) -> PlanElement:
-    """Create an element from azimuth and curvature, both clockwise; in an element, both are counter-clockwise from
-    east.
-    """
+    """Create an element, whose angles are counter-clockwise from east, from clockwise azimuth and curvature."""
     direction = np.pi / 2.0 - azimuth
     return PlanElement(x_m=x, y_m=y, direction_rad=direction, first=-first, last=-last, length_m=length)
 
@@ -213,7 +211,7 @@ def _clothoid(east: float, north: float, azimuth: float, rate: float, arc: float
 
 
 def _turn(element: PlanElement) -> PlanElement:
-    """Return an element passed in the opposite direction."""
+    """Return an element in the opposite direction."""
     (x, y), direction = _end(element)
     return replace(
         element, x_m=float(x), y_m=float(y), direction_rad=direction + np.pi, first=-element.last, last=-element.first
@@ -234,7 +232,7 @@ def _profile(path: str, row: Row) -> ProfileElement:
 
 
 def _cant(path: str, row: Row, plan: Sequence[PlanElement]) -> CantElement:
-    """Create an element of cant, with the rails raised and lowered by half of the cant.
+    """Create a cant element; the outer rail is raised and the inner rail is lowered by half of the cant.
 
     The sharpest curve within the element determines which rail is the outer rail.
     """

@@ -1,7 +1,7 @@
 """Network of tracks: track centrelines, connections of their ends, and routes through the network (P1 4.2(1)).
 
-Connections are stated by the file, or join ends within a tolerance of each other. At a switch, a train can pass between
-the stem and either leg, but not between the two legs.
+Connections are stated in the file, or are made between ends that are closer than a tolerance. At a switch, a train can
+pass between the stem and either leg, but not between the two legs.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ ANTENNA_UP_M: Final = 2.5  #: Assumed height of an antenna above the rails [m].
 #: Standard deviation of the assumed antenna height [m]; some antennas are on bogies, others on roofs.
 ANTENNA_SIGMA_M: Final = 1.5
 _DIRECTION_M: Final = 10.0  #: Length over which the direction of a track at its end is computed [m].
-#: Length up to which routes are searched first; the whole network is searched only if no route is found [m].
+#: Length limit of the first search for a route [m]; the whole network is searched if no shorter route is found.
 _NEAR_WAY_M: Final = 5_000.0
 _SAMPLE_M: Final = 50.0  #: Largest spacing of the samples in the spatial index [m].
 #: Number of nearest samples that are examined first for each position; more samples are examined if these are not
@@ -41,7 +41,7 @@ _SAMPLES: Final = 32
 _TOGETHER: Final = 256  #: Number of positions processed at once, which limits the memory for nearby samples.
 #: Cached properties of `Network` that do not depend on the connections.
 _OF_POINTS: Final = ("first_point", "points_m", "chainage_m", "length_m", "height_m", "_way", "_index")
-_NAMED: Final = 8  #: Largest number of tracks that a message lists by name.
+_NAMED: Final = 8  #: Largest number of tracks for which a message lists all names.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +66,7 @@ class Candidates(RowArrays):
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Network(NotebookTable):
-    """Tracks, which extend between switches or open ends, and their connections."""
+    """Tracks between switches or open ends, and the connections of their ends."""
 
     tracks: tuple[Segment, ...]
     links: tuple[Link, ...]  #: Connections of track ends.
@@ -103,7 +103,7 @@ class Network(NotebookTable):
 
     @cached_property
     def chainage_m(self) -> Floats:
-        """Length in plan, on the ellipsoid, from the first point of the track to each of `points_m`, shape (V,) [m]."""
+        """Length on the ellipsoid from the first point of a track to each point of the track, shape (V,) [m]."""
         steps = np.linalg.norm(np.diff(self.points_m, axis=0), axis=1)
         steps[self.first_point[1:-1] - 1] = 0.0
         way = np.concatenate([[0.0], np.cumsum(steps)])
@@ -147,7 +147,7 @@ class Network(NotebookTable):
 
     @cached_property
     def passages(self) -> dict[tuple[int, int], dict[tuple[int, int], None]]:
-        """Ends (track, end) to which a train can pass from each end (track, end), over navigable connections."""
+        """For each track end, the ends of other tracks to which a train can pass; an end is a pair (track, end)."""
         passages: dict[tuple[int, int], dict[tuple[int, int], None]] = {}
         for link in self.links:
             if link.navigable:
@@ -158,21 +158,20 @@ class Network(NotebookTable):
 
     @cached_property
     def height_m(self) -> Floats:
-        """Ellipsoidal height of each of `points_m`, shape (V,) [m]; NaN where the map has none."""
+        """Ellipsoidal heights of the points, shape (V,) [m]; NaN where the map has no heights."""
         return read_only(np.concatenate([t.height_m for t in self.tracks]))
 
     @cached_property
     def _way(self) -> tuple[Floats, Floats]:
-        """Distances of all points, and of the starts of tracks, along one axis on which the tracks follow each other 1
-        m apart [m].
-        """
+        """Positions of points, and of starts of tracks, on an axis with all tracks in sequence, 1 m apart [m]."""
         before = np.concatenate([[0.0], np.cumsum(self.length_m + 1.0)[:-1]])
         return self.chainage_m + np.repeat(before, np.diff(self.first_point)), before
 
     def course_on(self, track: Indices, chainage_m: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return points in plan, unit vectors along the track, and heights at chainages on tracks.
+        """Return the points in plan, track directions and heights at chainages on tracks.
 
-        Points and vectors are in ECEF, shape (n, 3); heights have shape (n,). Chainages are limited to the track.
+        Points and unit direction vectors are in ECEF, shape (n, 3). Heights have shape (n,). Chainages are limited to
+        the track.
         """
         way, before = self._way
         at = before[track] + np.clip(chainage_m, 0.0, self.length_m[track])
@@ -191,17 +190,17 @@ class Network(NotebookTable):
 
     @cached_property
     def sigma_plan_m(self) -> float:
-        """Standard deviation of the tracks in plan [m]: the worst value stated, or the default of P1 4.1(3)."""
+        """Largest standard deviation of a track in plan [m]; the default is from P1 4.1(3)."""
         return sigma_of_files(self.tracks, "sigma_plan_m", SIGMA_PLAN_M)
 
     @cached_property
     def sigma_height_m(self) -> float:
-        """Standard deviation of the tracks' heights [m]: the worst value stated, or the default of P1 4.1(3)."""
+        """Largest standard deviation of a track's height [m]; the default is from P1 4.1(3)."""
         return sigma_of_files(self.tracks, "sigma_height_m", SIGMA_HEIGHT_M)
 
     @cached_property
     def datum_plan_m(self) -> float:
-        """Largest standard deviation of the transformation of a track from its datum [m]; part of `sigma_plan_m`."""
+        """Largest standard deviation of a track's datum transformation [m], included in `sigma_plan_m`."""
         return max(track.datum_plan_m for track in self.tracks)
 
     @property
@@ -211,9 +210,7 @@ class Network(NotebookTable):
 
     @cached_property
     def _index(self) -> tuple[scipy.spatial.cKDTree, Indices, Indices, float]:
-        """k-d tree of samples on all segments, segment and track of each sample, and half the largest sample spacing
-        [m].
-        """
+        """k-d tree of samples on all tracks, their segments and tracks, and half the largest sample spacing [m]."""
         steps = np.linalg.norm(np.diff(self.points_m, axis=0), axis=1)
         inner = np.ones(len(steps), dtype=np.bool_)
         inner[self.first_point[1:-1] - 1] = False
@@ -227,7 +224,7 @@ class Network(NotebookTable):
         return scipy.spatial.cKDTree(samples, balanced_tree=False), of, track, reach
 
     def _samples_near(self, points_m: Floats, within_m: float, least: int) -> tuple[Floats, Indices]:
-        """Return the distances and indices of all samples near each point, as arrays with at least `least` columns.
+        """Return the distances and indices of all samples near each point; the arrays have at least `least` columns.
 
         A sample is near if the piece of track that the sample represents can be within `within_m` of the point. The
         distance is infinite in unused columns.
@@ -244,7 +241,7 @@ class Network(NotebookTable):
         return distance, np.where(np.isfinite(distance), sample, 0).astype(np.intp)
 
     def near(self, latitude_deg: Floats, longitude_deg: Floats, *, within_m: float = 30.0, most: int = 8) -> Candidates:
-        """Return up to `most` tracks within `within_m` in plan of each position; coordinates have shape (n,) [deg]."""
+        """Return up to `most` tracks within a distance `within_m` in plan of each of n positions."""
         parts = [
             self._near(latitude_deg[k : k + _TOGETHER], longitude_deg[k : k + _TOGETHER], within_m, most)
             for k in range(0, max(len(latitude_deg), 1), _TOGETHER)
@@ -281,9 +278,9 @@ class Network(NotebookTable):
         )
 
     def place_on(self, track: Indices, latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Floats]:
-        """Return the chainages of positions projected on given tracks, and the distances in plan, shape (n,) each [m].
+        """Return the chainages of positions projected on given tracks, and their distances from the tracks in plan [m].
 
-        Both results are NaN without a track (-1) or a position (NaN).
+        Both results have shape (n,). They are NaN without a track (-1) or a position (NaN).
         """
         points = ecef_from_geodetic(latitude_deg, longitude_deg, np.zeros(len(latitude_deg)))
         chainage, offset = np.full(len(track), np.nan), np.full(len(track), np.nan)
@@ -295,7 +292,7 @@ class Network(NotebookTable):
         return chainage, offset
 
     def kilometrage_on(self, track: Indices, chainage_m: Floats) -> Floats:
-        """Return the kilometrage at chainages on given tracks, shape (n,) [m]; NaN where the map has none."""
+        """Return the kilometrage at chainages on given tracks, shape (n,) [m]; NaN where the map has no kilometrage."""
         kilometrage = np.full(len(track), np.nan)
         for number in np.unique(track[track >= 0]):
             rows = track == number
@@ -305,7 +302,7 @@ class Network(NotebookTable):
         return kilometrage
 
     def find_index(self, name: str) -> int:
-        """Return the index of a track by its name, or of an OpenStreetMap way by its id.
+        """Return the index of the track with a given name or OpenStreetMap way id.
 
         Raise SettingsError if there is no such track.
         """
@@ -317,18 +314,18 @@ class Network(NotebookTable):
             close = [n for n in self.names if name.lower() in n.lower()] or difflib.get_close_matches(name, self.names)
             few = len(self.names) <= _NAMED
             shown = ", ".join(map(repr, self.names if few else close[:3]))
-            hint = f"its tracks are {shown}" if few else f"similar: {shown}" if close else f"it has {len(self.names)}"
+            hint = f"it has {shown}" if few else f"similar: {shown}" if close else f"it has {len(self.names)} tracks"
             raise SettingsError(f"there is no track {name!r} in the network; {hint}")
         return self.names.index(name)
 
     def extend_routes(
         self, routes: Mapping[int, tuple[float, list[int]]], stop: int
     ) -> dict[int, tuple[float, list[int]]]:
-        """Extend routes to the two entries of the track `stop`, and return the shortest route to each entry.
+        """Extend routes to the track `stop`, and return the shortest route to each of the track's two entries.
 
-        `routes` has the routes so far by their last node, an exit of a track. A route consists of a length [m] and of
-        nodes of `graph`: the start node, and the nodes at which tracks are entered. An entry that no route reaches is
-        left out of the result.
+        A route consists of its length [m] and nodes of `graph`: the start node, and the entry of each track. The keys
+        of `routes` are the last nodes of the routes, which are exits. The keys of the result are the entries that a
+        route reaches.
         """
         import networkx as nx
 
@@ -348,7 +345,7 @@ class Network(NotebookTable):
         return reached
 
     def shortest_route(self, stops: Sequence[int]) -> list[int]:
-        """Return the tracks of the shortest route over given tracks in order, as indices.
+        """Return the shortest route that passes given tracks in order, as track indices.
 
         Raise MismatchError if there is no route.
         """
@@ -356,24 +353,22 @@ class Network(NotebookTable):
         if route is None:
             first = next(stop for k, stop in enumerate(stops, start=1) if self.route_over(stops[:k]) is None)
             raise MismatchError(
-                f"no route without turning back leads to track {self.names[first]!r} over navigable connections"
+                f"track {self.names[first]!r} cannot be reached over navigable connections without turning back"
             )
         return route
 
     def route_over(self, stops: Sequence[int]) -> list[int] | None:
-        """Return the indices of the tracks of the shortest route over given tracks in order; None without a route."""
+        """Return the shortest route that passes given tracks in order, as track indices; None without a route."""
         wanted = [stop for k, stop in enumerate(stops) if k == 0 or stop != stops[k - 1]]
         routes = {4 * wanted[0] + end: (0.0, [4 * wanted[0] + end]) for end in (1, 3)}
         for stop in wanted[1:]:
-            # a track that is entered at one end is left at the opposite end
+            # a train that enters a track at one end leaves it at the other end
             routes = {entry ^ 3: route for entry, route in self.extend_routes(routes, stop).items()}
         return [node // 4 for node in min(routes.values())[1]] if routes else None
 
 
 def end_points(network: Network) -> tuple[Floats, Floats]:
-    """Return the end points of tracks on the ellipsoid, and outward unit vectors at the ends, shape (tracks, 2, 3)
-    each.
-    """
+    """Return the track ends on the ellipsoid and outward unit vectors at the ends, shape (tracks, 2, 3) each."""
     first, last = network.first_point[:-1], network.first_point[1:] - 1
     place, before = network._way
     inner = np.clip(np.searchsorted(place, before + _DIRECTION_M), first + 1, last)

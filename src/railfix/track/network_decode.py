@@ -1,12 +1,11 @@
-"""Probability of each track at each position of a log, with an error that is common to all positions.
+"""Probability of each track at each position of a log, if the positions have a common error.
 
-The model is a hidden Markov model (Newson & Krumm 2009, doi:10.1145/1653771.1653818). The state of the model is a track
-near the position, or an unmapped track, together with the common error of the positions. The common error is a
-first-order Gauss-Markov process in each of the directions east, north and up, on a lattice (Ehrenfest's urn; Kac 1947,
-doi:10.2307/2304386). The remaining error of each position has heavy tails (Student's t) and a correlation time
-`correlation_s`; the log likelihood of a position is weighted with the fraction of this time that the position
-represents. An unmapped track is parallel to the nearest track at a constant distance (`SHIFTS_M`) and clear of all
-other tracks, or it can be anywhere.
+The model is a hidden Markov model (Newson & Krumm 2009, doi:10.1145/1653771.1653818). A state of the model is a mapped
+or unmapped track near the position, and a value of the common error. The common error is a first-order Gauss-Markov
+process in each of the directions east, north and up, on a lattice (Ehrenfest's urn; Kac 1947, doi:10.2307/2304386). The
+remaining error of each position has heavy tails (Student's t) and a correlation time `correlation_s`; the log
+likelihood of a position is weighted with the fraction of this time that the position represents. An unmapped track is
+parallel to the nearest track at a constant distance (`SHIFTS_M`) and clear of all other tracks, or it can be anywhere.
 """
 
 from __future__ import annotations
@@ -22,8 +21,8 @@ from railfix.core.array_functions import cheapest_path
 from railfix.core.arrays import Floats, Indices, Masks, read_only
 from railfix.track.network import CLEARANCE_M, UNMAPPED_PRIOR, Candidates, Network
 
-#: Negative logarithm of the likelihood of a position on an unmapped track that is parallel to no track, relative to the
-#: likelihood of a position on a mapped track.
+#: Negative logarithm of the likelihood of a position on an unmapped track that is parallel to no track, relative to a
+#: position exactly on a mapped track.
 _UNMAPPED_COST: Final = 5.0
 #: Distances of a parallel unmapped track to the right of the nearest mapped track [m].
 SHIFTS_M: Final = np.concatenate([np.arange(-15.0, -2.0, 2.0), np.arange(3.0, 16.0, 2.0)])
@@ -34,55 +33,54 @@ _SHARES: Final = 1.0 / np.abs(SHIFTS_M) / (1.0 / np.abs(SHIFTS_M)).sum()
 _DRIFTS: Final = 1e-3
 _SHIFT_STEP_M: Final = 2.0  #: Spacing of `SHIFTS_M` on either side [m].
 _FREEDOM: Final = 8.0  #: Degrees of freedom of Student's t for position errors.
-# Negative logarithms of transition probabilities per position. With these values, a train is on unmapped track for the
-# fraction `UNMAPPED_PRIOR` of the time, in periods of a quarter of an hour. A change of track by way of unmapped track
-# is as improbable as a change between tracks without a connection.
-_JUMP_COST: Final = 17.0  #: From a track to a track without connection.
+# Negative logarithms of transition probabilities per position. These values imply that a train is on unmapped track for
+# the fraction `UNMAPPED_PRIOR` of the time, in periods of a quarter of an hour. A change of track by way of unmapped
+# track is as improbable as a change between unconnected tracks.
+_JUMP_COST: Final = 17.0  #: From a mapped track to an unconnected mapped track.
 _LEAVE_COST: Final = 12.0  #: From a mapped track to an unmapped track that is parallel to no track.
 _ENTER_COST: Final = 5.0  #: From an unmapped track that is parallel to no track to a mapped track.
 _LEAVE_BESIDE_COST: Final = 10.0  #: From a mapped track to a parallel unmapped track.
 _ENTER_BESIDE_COST: Final = 7.0  #: From a parallel unmapped track to a mapped track.
 #: Negative logarithm of the probability of passing an open end, where the map ends.
 _OPEN_COST: Final = 2.0
-#: Distance beyond an open end at which a position is off the map, in standard deviations.
+#: Distance beyond an open end above which a position is off the map, in standard deviations of the position.
 _BEYOND_SIGMAS: Final = 5.0
-#: Smallest and largest distance beyond an open end at which a position is off the map [m].
+#: Lower and upper bound of the distance `_BEYOND_SIGMAS` [m].
 _BEYOND_M: Final = (CLEARANCE_M, 10.0)
 _ROUNDED_M: Final = 1e-6
-#: Constant part of the largest excess of the path length over the straight distance between two positions [m]; the path
-#: is longer in a bend, for example.
+#: A transition is possible if the path exceeds the straight distance between two positions by at most this length [m]
+#: plus `_SLACK_SHARE` times the straight distance. The path is longer than this distance in bends.
 _SLACK_M: Final = 30.0
-#: Largest excess of the path length, in addition to `_SLACK_M`, as a fraction of the straight distance.
+#: Fraction of the straight distance; see `_SLACK_M`.
 _SLACK_SHARE: Final = 0.2
-#: Difference between path length and straight distance at which the probability of a transition over joints is halved
-#: [m].
+#: Excess of the path length over the straight distance that halves the transition probability over joints [m].
 _PASSING_M: Final = 5.0
-#: Cost of a change of track in the returned sequence, in expected pairs of successive positions on correct tracks.
+#: Cost of a change of track in the returned sequence, in the unit of its gain: expected pairs of successive positions
+#: on correct tracks.
 _CHANGE: Final = 0.5
-#: Cost of a change of track at a joint. This cost is smaller, because a short track of a switch has only one or two
-#: positions.
+#: Cost of a change of track at a joint; smaller, because a short track in a switch has only one or two positions.
 _CHANGE_AT_JOINT: Final = 0.05
-_AT_JOINT: Final = 0.01  #: Transition probability above which a change of track counts as a change at a joint.
+_AT_JOINT: Final = 0.01  #: Transition probability from which a change of track counts as a change at a joint.
 COMMON_S: Final = 600.0  #: Correlation time of the common error [s].
-#: Number of balls of the urn of a horizontal axis; the variance in squared steps is a quarter of the number.
+#: Number of balls in the urn of a horizontal axis. The common error has one more value per axis than the urn has balls.
 _BALLS: Final = 12
-_BALLS_UP: Final = 8  #: Number of balls of the urn of the vertical axis.
+_BALLS_UP: Final = 8  #: Number of balls in the urn of the vertical axis.
 _BLOCK: Final = 1024  #: Number of positions whose probabilities are in memory at once, if heights are not used.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Residuals:
-    """Positions relative to candidate tracks: n positions with up to m candidates each, and S values of `SHIFTS_M`."""
+    """Residuals of n positions with up to m candidate tracks each; S is the number of `SHIFTS_M`."""
 
     across: Floats  #: Unit vector to the right of the track, east and north, shape (n, m, 2).
-    offset_m: Floats  #: Distance to the right of the track, shape (n, m); infinite without a candidate.
+    offset_m: Floats  #: Distance of the position to the right of the track, shape (n, m); infinite without a candidate.
     beyond_m: Floats  #: Distance of the position beyond an end of the track, shape (n, m); 0 if not beyond.
     above_m: Floats  #: Height of the position above the expected antenna height, shape (n, m); NaN without a height.
-    #: Whether an unmapped track at each of `SHIFTS_M` from the nearest track is clear of all tracks, shape (n, S).
+    #: Whether an unmapped track at a distance `SHIFTS_M` from the nearest track is clear of all tracks, shape (n, S).
     clear: Masks
-    #: Distance by which the nearest track is to the right of the nearest track of the previous position, shape (n,).
+    #: Distance of the nearest track to the right of the previous position's nearest track, shape (n,).
     moved_m: Floats
-    #: Whether the nearest tracks of this position and of the previous position have opposite directions, shape (n,).
+    #: Whether the nearest track has a direction opposite to the previous position's nearest track, shape (n,).
     turned: Masks
     sigma_m: Floats  #: Standard deviation of a position per horizontal axis, shape (n,).
     sigma_up_m: Floats  #: Standard deviation of the height, shape (n,).
@@ -100,14 +98,14 @@ class Transitions:
         self._track, self._place = candidates.track, candidates.chainage_m
         self._clear, self._moved, self._turned = residuals.clear, residuals.moved_m, residuals.turned
         self._reach = (1.0 + _SLACK_SHARE) * step_m + _SLACK_M
-        #: By track and end: the search limit, and the path lengths up to this limit from this end to the ends of other
-        #: tracks [m].
+        #: Cached path lengths: the key is a track and one of its ends; the value is the search limit and the path
+        #: lengths from this end to `graph` nodes within the limit [m].
         self._ways: dict[tuple[int, int], tuple[float, dict[int, float]]] = {}
         self._rest = np.where(self._track >= 0, network.length_m[self._track], np.nan) - self._place
         to_end = np.fmin(self._place, self._rest)
-        #: Whether an end of the track is within reach of the position before each transition, shape (n - 1, m).
+        #: Whether the train can reach an end of the track from the position before a transition, shape (n - 1, m).
         self._leaves = to_end[:-1] <= self._reach[:, None]
-        #: Whether an end of the track is within reach of the position after each transition, shape (n - 1, m).
+        #: Whether the train can reach the position after a transition from an end of the track, shape (n - 1, m).
         self._enters = to_end[1:] <= self._reach[:, None]
         ends = np.array([[(t, e) not in network.passages for e in (0, 1)] for t in range(len(network.tracks))])
         at_end = ends[self._track] & (np.stack([self._place, self._rest], axis=-1) <= _ROUNDED_M)
@@ -119,10 +117,9 @@ class Transitions:
         self._left = (self._same & opens[1:, None, :]).any(axis=2)
         #: Whether the train enters the track over an open end, because the previous position is beyond that end.
         self._entered = (self._same & opens[:-1, :, None]).any(axis=1)
-        # an error does not explain a single position beyond the end, because errors do not change by metres in one step
+        # errors are assumed not to change by metres in one step, so they do not explain one position beyond the end
         stays = np.where(opens, np.exp(-_student((_BEYOND_SIGMAS * beyond) ** 2)), 1.0)
-        #: Likelihoods of staying on a track if only the previous position, or only the next position, is beyond an open
-        #: end of the track.
+        #: Likelihoods of remaining on a track, if only the previous or only the next position is beyond an open end.
         self._stays = np.where(self._left, 1.0, stays[:-1]), np.where(self._entered, 1.0, stays[1:])
 
     @property
@@ -142,15 +139,14 @@ class Transitions:
         share[:m, -1] = np.where(left, np.exp(-_OPEN_COST), np.exp(-_LEAVE_COST))
         share[-1, :m] = np.where(entered, np.exp(-_OPEN_COST), np.exp(-_ENTER_COST))
         share[-1, -1] = 1.0
-        # A train beyond an open end is on unmapped track. Since a log begins on unmapped track with `UNMAPPED_PRIOR`,
-        # the transition from a track to unmapped track has the same factor, so that a run off the map and the same run
-        # in reverse are equally probable.
+        # A log begins on unmapped track with the probability `UNMAPPED_PRIOR`. The transition to unmapped track over an
+        # open end has the same factor, so that a run off the map and its reverse are equally probable.
         share[:, m:-1] = np.exp(-_LEAVE_BESIDE_COST) * free
         share[:m, m:-1][left] = UNMAPPED_PRIOR * np.exp(-_OPEN_COST) * free
         share[m:-1, :m] = np.where(entered, np.exp(-_OPEN_COST), np.exp(-_ENTER_BESIDE_COST))
         share[:m, :m] = np.where(same, 1.0, np.exp(-_JUMP_COST))
         share[m:-1, m:-1] = _shifted(float(self._moved[k + 1]), bool(self._turned[k + 1]))
-        # an unmapped track can be parallel to a track on one part, and to no track on another part
+        # a part of an unmapped track can be parallel to a mapped track
         share[-1, m:-1], share[m:-1, -1] = UNMAPPED_PRIOR * free, UNMAPPED_PRIOR * np.exp(-_ENTER_COST)
         for i, j in np.argwhere(self._leaves[k][:, None] & self._enters[k] & ~same).tolist():
             way = self._way(k, i, j)
@@ -161,10 +157,9 @@ class Transitions:
         return share
 
     def _way(self, k: int, i: int, j: int) -> float:
-        """Return the length of the path from candidate i of position k to candidate j of position k + 1 through track
-        ends [m].
+        """Return the path length from candidate i at position k to candidate j at position k + 1 [m].
 
-        The length is infinite beyond the search limit.
+        The path leads through track ends. Its length is infinite beyond the search limit.
         """
         a, b, reach = int(self._track[k, i]), int(self._track[k + 1, j]), float(self._reach[k])
         least = np.inf
@@ -197,16 +192,14 @@ def _shifted(moved_m: float, turned: bool) -> Floats:
     apart = np.abs(place[:, None] - SHIFTS_M)
     nearest = apart == apart.min(axis=1, keepdims=True)
     drifted = _DRIFTS * (apart <= apart.min(axis=1, keepdims=True) + _SHIFT_STEP_M)
-    # otherwise the shifted track is the reference track, or too far from it
+    # a track at no known shift is the reference track itself, or too far from it
     known = apart.min(axis=1, keepdims=True) <= _SHIFT_STEP_M
     return np.asarray(np.where(nearest, 1.0, drifted) * known)
 
 
 @lru_cache(maxsize=256)
 def _urn(balls: int, seconds: float) -> tuple[Floats, Floats]:
-    """Return the equilibrium probabilities of an urn, and the transition matrix (row to column) over a number of
-    seconds.
-    """
+    """Return the equilibrium probabilities of an urn's states, and its transition matrix (row to column)."""
     change = 0.5 * (1.0 - np.exp(-seconds / COMMON_S))
     passages = [
         np.convolve(_binomial(inside, 1.0 - change), _binomial(balls - inside, change)) for inside in range(balls + 1)
@@ -222,7 +215,7 @@ def _binomial(count: int, share: float) -> Floats:
 
 
 class _CommonError:
-    """Lattice of the common error: C values in plan times U heights; `first` has the initial probabilities (C, U)."""
+    """Lattice of C common errors in plan and U in height; `first` are the initial probabilities, shape (C, U)."""
 
     def __init__(self, residuals: Residuals) -> None:
         self._balls_up = _BALLS_UP if residuals.common_up_m > 0.0 else 0
@@ -237,7 +230,7 @@ class _CommonError:
         return self._through(share, _urn(_BALLS, seconds)[1].T, _urn(self._balls_up, seconds)[1].T)
 
     def earlier(self, value: Floats, seconds: float) -> Floats:
-        """Return the expectation of `value` for each lattice point a number of seconds earlier, shape (..., C, U)."""
+        """Return the expectation of `value`, given the lattice point a number of seconds earlier, shape (..., C, U)."""
         return self._through(value, _urn(_BALLS, seconds)[1], _urn(self._balls_up, seconds)[1])
 
     def _through(self, values: Floats, plan: Floats, up: Floats) -> Floats:
@@ -262,14 +255,14 @@ def _student(square: Floats) -> Floats:
 
 
 def _likelihood(residuals: Residuals, lattice: _CommonError, k: int) -> Floats:
-    """Return the likelihood of position k given each state, up to a factor, shape (m + S + 1, C, U)."""
+    """Return the likelihood of position k given each state, up to a common factor, shape (m + S + 1, C, U)."""
     m, offset = residuals.offset_m.shape[1], residuals.offset_m[k]
     known = np.flatnonzero(np.isfinite(offset))
     across, beyond = residuals.across[k, known], residuals.beyond_m[k, known, None]
     off_track = offset[known, None] - across @ lattice.plan_m.T
     square = off_track**2
     if beyond.any():
-        # the common error explains part of a distance beyond the end of the track; only the rest counts as an error
+        # the common error may explain a part of the distance beyond the end of the track; only the rest is a residual
         along = np.stack([-across[:, 1], across[:, 0]], axis=-1) @ lattice.plan_m.T
         square += np.where(beyond != 0.0, np.maximum(np.abs(beyond) - np.sign(beyond) * along, 0.0), 0.0) ** 2
     cost = np.full((m + len(SHIFTS_M) + 1, *lattice.first.shape), np.inf)
@@ -293,8 +286,8 @@ def decode(residuals: Residuals, moves: Transitions) -> tuple[Indices, Floats]:
     Returns
     -------
     tuple
-        Column of each position's candidate in the best sequence, shape (n,); m for no track. The best sequence
-        maximises the expected number of successive pairs on correct tracks.
+        Column of each position's candidate in the best sequence, shape (n,); m if the position is on no candidate. The
+        best sequence maximises the expected number of successive pairs on correct tracks.
 
         Probabilities of the candidates and of no track given the whole log, shape (n, m + 1).
     """
@@ -308,7 +301,7 @@ def decode(residuals: Residuals, moves: Transitions) -> tuple[Indices, Floats]:
     probability, gains, changes = np.empty((n, m + 1)), np.empty((n - 1, m + 1, m + 1)), moves.changes
     after = expected = np.ones((states, *lattice.first.shape))
     move = np.eye(states)
-    none = np.arange(m + 1)  # first state of each group: each candidate, and all unmapped states together
+    none = np.arange(m + 1)  # first state of each group; a group is one candidate, or all unmapped tracks
     for start in reversed(firsts):
         block = [at for _, at in _forward(residuals, moves, lattice, start, firsts[start], min(start + length, n))]
         for k in reversed(range(start, start + len(block))):
@@ -365,7 +358,7 @@ def _forward(
 
 
 def _sequence(probability: Floats, gains: Floats) -> Indices:
-    """Return the sequence with the largest expected number of correct successive pairs minus the cost of changes."""
+    """Return the sequence that maximises the sum of `gains`, as columns of `probability`."""
     if len(probability) == 1:
         return np.asarray(probability.argmax(axis=1))
     nothing = np.zeros(probability.shape[1])

@@ -1,4 +1,4 @@
-"""Matching of the positions of a run to the tracks of a network, with the probability of each track."""
+"""Match the positions of a run to the tracks of a network, and compute the probability of each track."""
 
 from __future__ import annotations
 
@@ -21,30 +21,29 @@ from railfix.track.network import ANTENNA_SIGMA_M, ANTENNA_UP_M, CLEARANCE_M, Ca
 from railfix.track.network_decode import SHIFTS_M, Residuals, Transitions, decode
 from railfix.track.track import ANOTHER_PLACE_M
 
-#: Standard deviation of the distance of positions from their track [m], if the log states none and none can be
-#: estimated.
+#: Standard deviation of distances from the track, if it is neither stated in the log nor can be estimated [m].
 SIGMA_M: Final = 4.0
 _LEAST_SIGMA_M: Final = 1.0  #: Lower bound of the estimated standard deviation of the distance [m].
-#: A position is used in the estimate if the second nearest track is farther away than the nearest by more than this
-#: [m].
+#: Minimum difference of the distances to the nearest and second nearest track, for positions in the estimate [m].
 _ALONE_M: Final = 15.0
-#: Median distance of positions from their track beyond which the positions count as off the track [m].
+#: Positions count as off the track if their median distance, scaled to a standard deviation, exceeds both this value
+#: [m] and `_BESIDE` times the position noise.
 _LARGEST_LEVEL_M: Final = 5.0
-_BESIDE: Final = 3.0  #: This limit as a multiple of the position noise; the larger of both limits applies.
+_BESIDE: Final = 3.0  #: Multiple of the position noise; see `_LARGEST_LEVEL_M`.
 _ENOUGH: Final = 30  #: Minimum number of positions to estimate the standard deviation.
 #: Upper bound of the standard deviation of the common error of all positions (satellites, atmosphere, map) [m].
 _COMMON_M: Final = 2.0
-#: Ratio of the standard deviation of the common error to the stated standard deviation, within the bound `_COMMON_M`.
+#: Ratio of the standard deviation of the common error to the stated standard deviation.
 _COMMON_SHARE: Final = 0.7
-_BEST: Final = 0.1  #: Quantile of the stated standard deviations from which the common error is computed.
+_BEST: Final = 0.1  #: Quantile of the stated standard deviations to which `_COMMON_SHARE` applies.
 _WITHIN_M: Final = 30.0  #: Minimum search distance for tracks [m].
-_WITHIN_SIGMAS: Final = 5.0  #: Search distance for tracks in standard deviations.
+_WITHIN_SIGMAS: Final = 5.0  #: Search distance for tracks, in standard deviations of the position.
 _FARTHEST_M: Final = 100.0  #: Maximum search distance for tracks [m].
-_FAR: Final = 6.0  #: A position is far from all tracks beyond this multiple of the search distance.
-#: Positions far from all tracks count as wrong if the train is near a track before and after them within this time [s].
+_FAR: Final = 6.0  #: Factor by which the search distance is larger for positions without a near track.
+#: Positions without a candidate are rejected if the adjacent positions with candidates are at most this time apart [s].
 _WRONG_S: Final = 60.0
-_MOST_FAR: Final = 8  #: Largest number of candidate tracks for a position far from all tracks.
-#: Values in `Candidates` where there is no further track.
+_MOST_FAR: Final = 8  #: Largest number of candidate tracks for a position without a near track.
+#: Values in `Candidates` for missing tracks.
 _NO_TRACK: Final = {"track": -1, "chainage_m": np.nan, "offset_m": np.inf}
 #: Values in `Matched` for a position that was not matched.
 _NO_MATCH: Final = {"track": -1, **dict.fromkeys(("chainage_m", "offset_m", "probability", "probabilities"), np.nan)}
@@ -52,12 +51,13 @@ _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard no
 _ROUNDED_M: Final = 0.1  #: Tolerance in comparisons of the distance between tracks [m].
 _STEP_S: Final = 0.4  #: Time step assumed where times are missing or decrease [s].
 _MOST_TRACKS: Final = 16  #: Largest number of candidate tracks for a position.
-_APART_UP_M: Final = 1.0  #: Heights are used if the heights of candidate tracks differ by more than this [m].
+#: Heights are used if the candidate tracks of a position differ in height by more than this value [m].
+_APART_UP_M: Final = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlanLog(RowArrays):
-    """Positions of a log in plan, n rows; shapes (n,), NaN or NaT where unknown."""
+    """Positions of a log in plan, shape (n,) each; unknown values are NaN or NaT."""
 
     path: str
     time: Datetimes
@@ -70,8 +70,7 @@ class PlanLog(RowArrays):
     notes: tuple[str, ...] = ()
 
     def transform_to(self, network: Network, **motion: Unpack[MapMotion]) -> tuple[PlanLog, FrameShift]:
-        """Return the positions transformed from the frame of the satellites to the frame of the map, and a description
-        of the shift.
+        """Transform the positions from the satellites' frame to the map's frame, and describe the shift.
 
         Raise MismatchError if the log is far from the network, or if the transformation depends on time and the log has
         no times.
@@ -116,7 +115,7 @@ def _check_region(network: Network, log: PlanLog) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Matched:
-    """Positions of a log matched to the tracks of a network, n rows; shapes (n,) unless stated."""
+    """Positions of a log matched to the tracks of a network, n rows; arrays have shape (n,) unless stated otherwise."""
 
     track: Indices  #: Track in the best sequence of tracks; -1 if the position is on no track of the network.
     chainage_m: Floats  #: Chainage on the track.
@@ -124,8 +123,7 @@ class Matched:
     #: Probability of `track` given the whole log; NaN without a position, or for a position rejected as wrong.
     probability: Floats
     candidates: Candidates  #: Tracks near each position.
-    #: Probability of each candidate, shape (n, m). The probabilities and the probability of an unmapped track add up to
-    #: 1.
+    #: Probability of each candidate, shape (n, m). The sum over a row is 1 minus the probability of an unmapped track.
     probabilities: Floats
     notes: tuple[str, ...] = ()  #: Notes on assumptions about the log.
 
@@ -146,9 +144,7 @@ def read_plan_positions(
 
 
 def plan_log(log: PositionLog, *, antenna_up_m: float | None = None) -> PlanLog:
-    """Convert a position log to `PlanLog`; the sigma in plan is the root mean square of the sigmas of both horizontal
-    axes.
-    """
+    """Convert a position log to `PlanLog`; the sigma in plan is the root mean square of the east and north sigmas."""
     latitude, longitude, height = log.geodetic
     return PlanLog(
         path=log.path,
@@ -179,9 +175,9 @@ def match(
     log : PlanLog
         Positions in the order of travel, in the frame of the network.
     sigma_m : float, optional [m]
-        Standard deviation of the distance of positions from their track; by default as stated in the log, or estimated.
+        Standard deviation of a position's distance from the track; by default stated in the log or estimated.
     within_m : float, optional [m]
-        Largest distance of a position from its track; by default five standard deviations, limited to 30 to 100 m.
+        Largest distance of a position from its track; by default five standard deviations, with limits of 30 and 100 m.
     correlation_s : float [s]
         Correlation time of the position errors.
 
@@ -222,7 +218,7 @@ def match(
 
 
 def _sigma(network: Network, log: PlanLog, given: Indices, sigma_m: float | None) -> tuple[Floats, tuple[str, ...]]:
-    """Return the standard deviation of each position's distance from the track [m], and a note on assumed values."""
+    """Return the standard deviation of each position's distance from the track [m], and notes on assumed values."""
     if sigma_m is not None:
         return np.full(len(given), sigma_m), ()
     stated = np.isfinite(log.sigma_m[given])
@@ -235,10 +231,10 @@ def _sigma(network: Network, log: PlanLog, given: Indices, sigma_m: float | None
 
 
 def _estimate_sigma(network: Network, log: PlanLog, rows: Indices) -> tuple[float, str]:
-    """Return the standard deviation of distances from a track [m], and a clause on how it was obtained.
+    """Estimate the standard deviation of distances from a track [m], and describe in a clause how it was obtained.
 
-    It is estimated from the median distance of positions near a single track. Near parallel tracks, an error cannot be
-    distinguished from a position on another track.
+    Only positions near a single track are used, because near parallel tracks an error cannot be distinguished from a
+    position on the other track.
     """
     latitude, longitude = log.latitude_deg[rows], log.longitude_deg[rows]
     near = network.near(latitude, longitude, within_m=_FARTHEST_M, most=2)
@@ -254,7 +250,7 @@ def _estimate_sigma(network: Network, log: PlanLog, rows: Indices) -> tuple[floa
 
 
 def _time_notes(log: PlanLog, given: Indices) -> tuple[str, ...]:
-    """Return a note if times decrease."""
+    """Return a note if times in the log decrease."""
     back = np.flatnonzero(np.diff(log.time[given]) < np.timedelta64(0))
     if not len(back):
         return ()
@@ -263,7 +259,7 @@ def _time_notes(log: PlanLog, given: Indices) -> tuple[str, ...]:
 
 
 def _candidates(network: Network, latitude_deg: Floats, longitude_deg: Floats, within_m: float) -> Candidates:
-    """Find the tracks within a distance of each position; for positions far from all tracks, the distance is larger."""
+    """Find the tracks within a distance of each position, or within a larger distance if no track is near."""
     near = network.near(latitude_deg, longitude_deg, within_m=within_m, most=_MOST_TRACKS)
     far = np.abs(near.offset_m[:, 0]) > min(0.5 * within_m, _WITHIN_M)
     if far.any():
@@ -275,10 +271,10 @@ def _candidates(network: Network, latitude_deg: Floats, longitude_deg: Floats, w
 
 
 def _is_wrong(candidates: Candidates, time: Datetimes) -> Masks:
-    """Return a mask of the positions that are rejected as wrong because they are far from all tracks, shape (n,).
+    """Return a mask of the positions that are rejected because they have no candidate track, shape (n,).
 
-    A position far from all tracks is rejected if the last earlier position near a track, and the next later position
-    near a track, are at most `_WRONG_S` apart.
+    A position is rejected if the last position with a candidate before it and the first position with a candidate after
+    it are at most `_WRONG_S` apart.
     """
     near = np.flatnonzero(candidates.track[:, 0] >= 0)
     if not len(near):
@@ -290,9 +286,7 @@ def _is_wrong(candidates: Candidates, time: Datetimes) -> Masks:
 
 
 def _scale(residuals: Residuals, track: Indices, correlation_s: float) -> float:
-    """Estimate the ratio of actual to stated sigmas, at least 1, from changes of the offset from the track over
-    `correlation_s`.
-    """
+    """Estimate the ratio, at least 1, of actual to stated sigmas from changes of the offset over `correlation_s`."""
     seconds, distance = np.cumsum(residuals.seconds), residuals.offset_m
     rows = np.arange(len(seconds))
     later = np.minimum(np.searchsorted(seconds, seconds + correlation_s), len(rows) - 1)
@@ -304,9 +298,7 @@ def _scale(residuals: Residuals, track: Indices, correlation_s: float) -> float:
 
 
 def _median_scale(ratio: Floats) -> float:
-    """Return the spread of values relative to a standard normal distribution, at least 1, from the median of absolute
-    values.
-    """
+    """Estimate the standard deviation of normalised values, at least 1, from the median of their absolute values."""
     ratio = np.abs(ratio[np.isfinite(ratio)])
     return max(1.0, float(np.median(ratio)) / _NORMAL_MEDIAN) if len(ratio) else 1.0
 
@@ -348,7 +340,7 @@ def _residuals(
     weight[0] = 1.0
     sigma_up = np.full(len(given), np.nan) if log.sigma_up_m is None else log.sigma_up_m[given]
     sigma_up = np.where(np.isfinite(sigma_up), sigma_up, 2.0 * sigma_m)
-    # increase the sigmas, because reflections bias heights to one side for minutes
+    # increase the height sigmas, because reflections bias heights to one side for minutes
     sigma_up = sigma_up * _median_scale(np.nanmin(np.abs(above), axis=1, initial=np.inf) / sigma_up)
     axis, beyond = over(right, 0.0), over(np.where(outward, ahead_m, 0.0), 0.0)
     of_antenna = ANTENNA_SIGMA_M if log.antenna_up_m is None else 0.0
@@ -363,18 +355,18 @@ def _residuals(
         sigma_up_m=sigma_up,
         weight=weight,
         seconds=seconds,
-        # includes the error of the map's transformation, which is also common to all positions
+        # includes the error of the map's datum transformation, which is common to all positions
         common_m=float(np.hypot(min(_COMMON_SHARE * np.quantile(sigma_m, _BEST), _COMMON_M), network.datum_plan_m)),
         common_up_m=float(np.linalg.norm([of_codes, of_antenna, network.sigma_height_m])) if counts else 0.0,
     )
 
 
 def _beside(track: Indices, across: Floats, offset_m: Floats, beyond_m: Floats) -> dict[str, Any]:
-    """Compute the fields `clear`, `moved_m` and `turned` of `Residuals`, which describe parallel unmapped tracks."""
+    """Compute the fields of `Residuals` that describe parallel unmapped tracks: `clear`, `moved_m` and `turned`."""
     cosine = np.einsum("nmi,ni->nm", across, across[:, 0])
     offset = np.where(np.isfinite(offset_m), offset_m, 0.0)
     right_m = offset[:, :1] - offset * cosine  # distance of each candidate to the right of the nearest track
-    there = np.isfinite(offset_m) & (np.abs(beyond_m) <= CLEARANCE_M)  # the position is not beyond the track's end
+    there = np.isfinite(offset_m) & (np.abs(beyond_m) <= CLEARANCE_M)  # the position is not beyond an end of the track
     apart = np.where(there, np.abs(SHIFTS_M[:, None, None] - right_m), np.inf).min(axis=2)
     clear = (apart.T > CLEARANCE_M - _ROUNDED_M) & there[:, :1]
     before = np.concatenate([track[:1, :1], track[:-1, :1]])  # the nearest track of the previous position

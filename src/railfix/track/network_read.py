@@ -1,4 +1,4 @@
-"""Reading and connecting networks of tracks from map files, and checks for gaps, dead ends and kinks."""
+"""Read networks of tracks from map files, connect tracks, and check networks for gaps, dead ends and kinks."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from railfix.track.vector_file import CROSSING, read_layers
 from railfix.track.xml_files import Relation, read_railml_relations, read_rinf_relations
 
 TOLERANCE_M: Final = 0.5  #: Ends are connected up to this distance if the file states no connections [m].
-#: Largest change of direction of a train that passes from one track to another [rad]. Between the two legs of a switch,
-#: the direction would change by about pi.
+#: Largest change of direction at a connection that a train can pass [rad]. Between the two legs of a switch, the
+#: direction would change by about pi.
 _LARGEST_TURN_RAD: Final = np.radians(60.0)
 
 
@@ -52,8 +52,8 @@ def connect_network(tracks: list[Segment], paths: Sequence[FilePath], *, toleran
     whole = Network(tracks=tuple(tracks), links=())
     cuts = _places_of_ends(whole, tolerance_m)
     network, _ = _divide(whole, cuts)
-    note = f"tracks are connected at ends within {tolerance_m:g} m; {len(cuts)} tracks are divided where another "
-    note += "track ends at them"
+    note = f"tracks are connected at ends within {tolerance_m:g} m; {len(cuts)} tracks are divided where other "
+    note += "tracks end"
     if packed := [path for path in paths if ending(path) == ".pbf"]:
         note += (
             f"; {packed[0]} is read without node ids; to keep them, convert it: 'osmium cat FILE.osm.pbf -o FILE.osm'"
@@ -121,14 +121,14 @@ def _of_relations(tracks: list[Segment], relations: list[Relation], path: str) -
     if not known:
         raise InputFileError(path, f"none of its {len(relations)} net relations names a track of the file")
     links = tuple(Link(**{**vars(r), "first": number[r.first], "second": number[r.second]}) for r in known)
-    note = f"tracks are connected as {len(known)} net relations of the file state"
+    note = f"tracks are connected by {len(known)} net relations of the file"
     if len(known) < len(relations):
         note += f"; {len(relations) - len(known)} relations name a track that is not in the file"
     return Network(tracks=tuple(tracks), links=links, notes=(note,))
 
 
 def links_of_ends(network: Network, *, tolerance_m: float = TOLERANCE_M) -> tuple[Link, ...]:
-    """Return the connections of ends within `tolerance_m` of each other.
+    """Return connections between all ends that are within `tolerance_m` of each other.
 
     A connection is navigable if the direction changes by less than 60 deg. Ends on different levels are not connected.
     """
@@ -149,7 +149,7 @@ def links_of_ends(network: Network, *, tolerance_m: float = TOLERANCE_M) -> tupl
 
 
 def is_route(segments: Sequence[Segment]) -> bool:
-    """Return whether segments in their order form one route, with ends that meet and without reversals."""
+    """Return whether consecutive segments meet at their ends without a reversal of direction."""
     if first_gap(segments) is not None:
         return False
     _, outward = end_points(Network(tracks=tuple(orient(segments)), links=()))
@@ -157,7 +157,7 @@ def is_route(segments: Sequence[Segment]) -> bool:
 
 
 def _places_of_ends(whole: Network, tolerance_m: float) -> dict[int, list[float]]:
-    """Return by track index the ascending inner chainages at which another track ends within `tolerance_m` [m]."""
+    """Return the chainages [m] at which other tracks end within `tolerance_m`, in ascending order, by track index."""
     tracks = whole.tracks
     latitude = np.array([[t.latitude_deg[0], t.latitude_deg[-1]] for t in tracks]).ravel()
     longitude = np.array([[t.longitude_deg[0], t.longitude_deg[-1]] for t in tracks]).ravel()
@@ -175,7 +175,7 @@ def _places_of_ends(whole: Network, tolerance_m: float) -> dict[int, list[float]
 
 
 def _divide(whole: Network, places: Mapping[int, Sequence[float]]) -> tuple[Network, list[int]]:
-    """Return the network with tracks divided at inner chainages [m], and for each part the original track's index."""
+    """Divide tracks at chainages [m], and return the network of parts and the original track index of each part."""
     parts: list[tuple[Segment, int]] = []
     for k, track in enumerate(whole.tracks):
         way = whole.chainage_m[whole.first_point[k] : whole.first_point[k + 1]]
@@ -209,13 +209,13 @@ def _part(track: Segment, way: Floats, low: float, high: float, number: int) -> 
 _GAP_M: Final = 5.0
 #: Distance between connected ends above which the ends are reported as a joint that does not meet [m].
 _JOINT_M: Final = 0.5
-#: Largest change of direction over a navigable connection [deg]; a 1:4.5 switch turns by 12.5 deg over its length.
+#: Change of direction at a navigable connection above which a kink is reported [deg]; a 1:4.5 switch turns by 12.5 deg.
 _KINK_DEG: Final = 15.0
-#: Smallest spacing of parallel tracks at which vehicles can pass each other [m].
+#: Spacing of parallel tracks below which vehicles cannot pass each other [m].
 _LEAST_SPACING_M: Final = 2.5
-#: Distance from the end of a track within which the spacing is not checked, because tracks join in a switch [m].
+#: The spacing of tracks is not checked within this distance of their ends, because tracks join in switches [m].
 _SWITCH_M: Final = 80.0
-_LEAST_WAY_M: Final = 10.0  #: Length over which tracks must be too near each other to be reported [m].
+_LEAST_WAY_M: Final = 10.0  #: Minimum length on which tracks are too near each other before they are reported [m].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -312,7 +312,7 @@ def _joints(network: Network) -> Iterator[NetworkFinding]:
 
 
 def _too_near(network: Network) -> Iterator[NetworkFinding]:
-    """Yield pairs of tracks that are nearer to each other than `_LEAST_SPACING_M`, away from the ends of the tracks."""
+    """Yield pairs of tracks with a spacing below `_LEAST_SPACING_M`, except near their ends."""
     latitude = np.concatenate([t.latitude_deg for t in network.tracks])
     longitude = np.concatenate([t.longitude_deg for t in network.tracks])
     track = np.repeat(np.arange(len(network.tracks)), np.diff(network.first_point))

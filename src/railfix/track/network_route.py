@@ -1,4 +1,4 @@
-"""Route of a run through a network of tracks, and filling of gaps in the log along the shortest route."""
+"""Find a run's route through a network of tracks, and fill gaps in its log along the shortest route."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ from railfix.core.geodesy import ecef_from_geodetic
 from railfix.track.network import Network
 from railfix.track.network_match import Matched, PlanLog
 
-#: Rows to be filled: only rows without a position ("gaps"), or also rows with positions off the map ("off-map").
+#: Rows to be filled: rows without a position ("gaps"), or in addition rows with positions off the map ("off-map").
 Rows = Literal["gaps", "off-map"]
-#: Largest distance of a track from a position off the map, and largest difference between the length of a route and the
-#: distance travelled according to these positions [m].
+#: Limit for filling rows with positions off the map [m]. It applies to the distance of these positions from a track,
+#: and to the difference between route length and the distance travelled according to these positions.
 _DRIFT_M = 500.0
-_STEPS = 15  #: Number of steps between positions of which the median is taken, to suppress jumps.
+_STEPS = 15  #: Length of the median filter for steps between positions, which suppresses jumps.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Filled:
     """Positions of all rows of a log on a network, shapes (n,)."""
 
-    track: Indices  #: Index of the track; -1 without a position or a route.
+    track: Indices  #: Index of the track; -1 if the row has no position and was not filled.
     chainage_m: Floats  #: Chainage on the track.
-    #: Largest distance between the train and a filled position, if the train is on the route. Infinite before the first
-    #: and after the last known position; NaN where the position was not filled.
+    #: Largest distance of the train from a filled position, provided that the train is on the route. It is infinite
+    #: before the first and after the last known position, and NaN in rows that were not filled.
     bound_m: Floats
 
 
 def fill_gaps(network: Network, matched: Matched, log: PlanLog, *, rows_to_fill: Rows = "gaps") -> Filled:
     """Fill rows without a usable position along the shortest route between known positions.
 
-    The speed on the route is assumed to be constant. If the log has positions off the map and `rows_to_fill` is
-    "off-map", the speed of these positions is used instead.
+    The speed between known positions is assumed to be constant. If `rows_to_fill` is "off-map" and there are positions
+    off the map, the steps between these positions replace this assumption.
     """
     filled = Filled(
         track=matched.track.copy(), chainage_m=matched.chainage_m.copy(), bound_m=np.full(len(matched.track), np.nan)
@@ -70,9 +70,9 @@ def fill_gaps(network: Network, matched: Matched, log: PlanLog, *, rows_to_fill:
 def _fill_before(
     network: Network, matched: Matched, log: PlanLog, travelled_m: Floats, rows: Indices, filled: Filled
 ) -> None:
-    """Fill rows before the first or after the last known position, in place.
+    """Fill the rows before the first or after the last known position in `filled`.
 
-    `rows` begins at the known position. It is filled up to the first row without a position.
+    `rows` begin at the known position. They are filled up to the first row without a position.
     """
     rows = rows[: np.argmin([*np.isfinite(travelled_m[rows]), False])]
     if len(rows) < 2:
@@ -99,10 +99,9 @@ def _place(matched: Matched, row: int | np.intp) -> tuple[int, float]:
 
 
 def _distance_m(log: PlanLog) -> Floats:
-    """Return the distance travelled, shape (n,) [m]; NaN without a position.
+    """Return the distance travelled at each row, shape (n,) [m]; NaN without a position.
 
-    The distance is the sum of the steps between positions. Each step is replaced by the median over `_STEPS` steps, to
-    suppress jumps of positions.
+    The distance is the sum of the steps between positions, filtered by a median over `_STEPS` steps to suppress jumps.
     """
     from scipy.ndimage import median_filter
 
@@ -116,10 +115,10 @@ def _distance_m(log: PlanLog) -> Floats:
 def _put_on(
     filled: Filled, legs: tuple[Indices, Floats, Floats], rows: Indices, at: Floats, *, ends_known: bool = True
 ) -> None:
-    """Set the positions of rows on a route, in proportion to the values `at`, in `filled`.
+    """Distribute rows along a route in proportion to the increase of `at`, and set their positions in `filled`.
 
-    The first value of `at` belongs to the start of the route, the last value to the end. `ends_known` states that the
-    train's position is known at both ends of the route; otherwise the bound is infinite.
+    The first and last values of `at` are at the start and end of the route. `ends_known` is true if the train's
+    position is known at both ends of the route; otherwise the bound is infinite.
     """
     numbers, enter, leave = legs
     share = (at - at[0]) / (at[-1] - at[0]) if at[-1] > at[0] else np.full(len(at), 0.5)
@@ -135,10 +134,10 @@ def _put_on(
 def _fill_legs(
     network: Network, first: int, from_m: float, last: int, to_m: float
 ) -> tuple[Indices, Floats, Floats] | None:
-    """Return the tracks of the shortest route between two positions, and where the train enters and leaves each track
+    """Return the tracks of the shortest route between two positions, and the first and last chainages on each track
     [m].
 
-    The positions are given by track index and chainage [m]. The result is None if there is no route.
+    A position is a track index and a chainage [m]. The result is None if there is no route.
     """
     if first == last:
         return np.array([first]), np.array([from_m]), np.array([to_m])
@@ -158,11 +157,10 @@ def _fill_legs(
 
 
 def find_route(network: Network, matched: Matched, path: str = "the log") -> tuple[list[int], list[int]]:
-    """Return the tracks passed by a run in order of travel, and the tracks that cannot be joined to this route, as
-    indices.
+    """Return the tracks passed by a run in order of travel, and other tracks with positions, as indices.
 
-    Each track is in the route once. Raise MismatchError if no position lies on a track; the message names the log and
-    the location of the positions.
+    Each track is in the route once. The other tracks cannot be joined to the route. Raise MismatchError if no position
+    lies on a track; the message states the log and the location of the positions.
     """
     seen = matched.track[matched.track >= 0]
     if not len(seen):
@@ -175,7 +173,7 @@ def find_route(network: Network, matched: Matched, path: str = "the log") -> tup
         # not passed
         routes = [_choose_route(network, order, share) for order in (passed, passed[::-1])]
     once = [part for route in routes if route is not None for part in _once(network, route)]
-    # `fsum` does not depend on the order, so that the same tracks in opposite order have an equal sum
+    # `fsum` gives equal sums for a route and its reverse, because its result does not depend on the order
     route = max(once, key=lambda leg: fsum(share.get(t, 0.0) for t in leg))
     return route, [t for t in dict.fromkeys(passed) if t not in route]
 
@@ -187,7 +185,7 @@ def left_out_note(network: Network, left_out: Sequence[int]) -> str:
 
 
 def _beside(network: Network, matched: Matched) -> str:
-    """Return a clause on the distance between positions and tracks, for the message that no position is on a track."""
+    """Return the end of the message that no position is on a track: the distance of the positions from a track."""
     track, offset = matched.candidates.track[:, 0], matched.candidates.offset_m[:, 0]
     near = track >= 0
     if not near.any():
@@ -200,9 +198,9 @@ def _beside(network: Network, matched: Matched) -> str:
 
 
 def _once(network: Network, route: list[int]) -> list[list[int]]:
-    """Return the longest parts of a route that pass no joint twice.
+    """Split a route into the longest parts that pass no joint twice.
 
-    A part may, however, end at a joint that the part has already passed.
+    A part may end at a joint that it has passed before.
     """
     joints = _joints(network, route)
     parts: list[list[int]] = []

@@ -17,19 +17,19 @@ class Passes(NamedTuple):
 
     position: Indices  #: Index of the position.
     segment: Indices  #: Index of the segment.
-    #: Distance from the start of the segment to the projection of the position on the extended segment.
+    #: Distance from the start of the segment to the position's projection on the extended segment.
     along_m: Floats
     foot_m: Floats  #: Distance from the start of the segment to the point of the segment nearest to the position.
-    offset_m: Floats  #: Vector from the nearest point to the position, shape (P, 3).
-    lowest: Masks  #: True if no adjacent segment in the list is nearer to the position.
-    again: Masks  #: True if the previous segment is equally near, because both share the nearest point.
+    offset_m: Floats  #: Vector from the segment's nearest point to the position, shape (P, 3).
+    lowest: Masks  #: True if neither the previous nor the next segment is nearer to the position.
+    again: Masks  #: True if the previous segment has the same nearest point.
 
 
 def find_segments_near(ecef_m: Floats, trajectory: Trajectory, reach_m: Floats | float) -> Passes:
-    """Find all segments within `reach_m` of each position (n, 3).
+    """Find the segments within `reach_m` of each position, shape (n, 3).
 
-    The result has all segments with a middle within `reach_m` plus half of the longest segment; some are farther than
-    `reach_m`.
+    The search is by the middles of segments, within `reach_m` plus half the longest segment. Some segments found are
+    therefore farther than `reach_m`.
     """
     length, tangent = trajectory.length_m, trajectory.tangent
     middle = 0.5 * (trajectory.ecef_m[1:] + trajectory.ecef_m[:-1])
@@ -51,7 +51,7 @@ def find_segments_near(ecef_m: Floats, trajectory: Trajectory, reach_m: Floats |
 
 
 def short_distance_m(difference_m: Floats, turn_m: float) -> Floats:
-    """Return differences of arc length in the shorter direction of a closed line.
+    """Return differences of arc length along the shorter part of a closed line.
 
     `turn_m` is the length of the closed line. For an open line, `turn_m` is infinite, and differences are unchanged.
     """

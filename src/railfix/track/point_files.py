@@ -1,4 +1,4 @@
-"""Readers of track maps in CSV with named columns, and in GeoJSON (RFC 7946), and writer of CSV track maps."""
+"""Read track maps from GeoJSON (RFC 7946) and from CSV with named columns, and write CSV track maps."""
 
 from __future__ import annotations
 
@@ -36,13 +36,13 @@ from railfix.track.vector_file import (
 RFC_CRS: Final = "OGC:CRS84"
 #: Property that identifies a connection of two tracks (`railfix.track.network_read`).
 RELATION: Final = "netelementA"
-#: Key under which all properties and the id of a feature are kept in the properties of its lines.
+#: Key in the properties of a line, whose value is all properties and the id of the line's feature.
 _FEATURE: Final = "@feature"
 _MEMBERS: Final = ("height_datum", "geoid", "name", "sigma_plan_m", "sigma_height_m")
 
 
 def _lines(path: str, node: dict[str, Any], label: str, inherited: dict[str, Any]) -> Iterator[_GeojsonLine]:
-    """Yield every LineString in a GeoJSON object, with the properties and members of the objects that contain it.
+    """Yield each LineString in a GeoJSON object, with the properties and members of the objects that contain it.
 
     Raise InputFileError if an object has no lines or no geometry.
     """
@@ -94,7 +94,7 @@ def _is_no_line(feature: dict[str, Any]) -> bool:
 
 
 def _identity(feature: dict[str, Any]) -> dict[str, str]:
-    """Return the name or else the id of a feature, as property "name"; an empty dictionary if there is neither."""
+    """Return the name of a feature, or its id if it has no name, as property "name"; empty if it has neither."""
     properties, identity = feature.get("properties"), feature.get("id")
     name = get_name(
         properties if isinstance(properties, dict) else {}, fallback="" if identity is None else str(identity)
@@ -138,9 +138,7 @@ class _GeojsonLine:
         raise self.error(f"{key} is {value!r}; a text was expected")
 
     def array(self, key: str, blank: float) -> Floats | None:
-        """Return a property with one value per point, shape (n,), or None if the property is missing; null becomes
-        `blank`.
-        """
+        """Return a property with one value per point, shape (n,), or None if it is missing; null becomes `blank`."""
         value = self.properties.get(key)
         if value is None:
             return None
@@ -156,7 +154,7 @@ class _GeojsonLine:
 
 
 def _crs_member(path: str, document: dict[str, Any]) -> str | None:
-    """Return the CRS of the ``crs`` member (GeoJSON 2008, section 3), which many programs write; None if absent."""
+    """Return the CRS of the ``crs`` member (GeoJSON 2008, section 3), which many programs write; None if missing."""
     member = document.get("crs")
     if member is None:
         return None
@@ -218,7 +216,7 @@ def _without_geometry(document: dict[str, Any]) -> list[int]:
 
 
 def _of_overpass(path: str, document: dict[str, Any], reading: MapReading) -> list[Segment]:
-    """Return the ways of an Overpass JSON document as segments; ways that are not tracks are left out, with a note."""
+    """Return the ways of an Overpass JSON document as segments; a note states which ways are left out as no tracks."""
     of_file = replace(reading, crs=choose_crs(path, reading.crs, "EPSG:4326"))
     ways = [(way, no_track(way.row, of_openstreetmap=True)) for way in read_overpass(path, document["elements"])]
     segments = [
@@ -236,7 +234,7 @@ def _segment(line: _GeojsonLine, crs: str, reading: MapReading) -> Segment:
     place = _in_frame(line.source, crs, line.coordinates)
     of_way = get_metadata(line.feature)
     heights = None
-    if line.coordinates[:, 2:].any():  # heights that are all 0 count as missing, as in files of other formats
+    if line.coordinates[:, 2:].any():  # if all heights are 0, they count as missing
         heights = heights_of_file(
             line.coordinates[:, 2] * unit_of_heights(crs), place, replace(reading, crs=crs), path=line.source,
             datum=line.text("height_datum"), geoid=line.text("geoid"), geoid_m=line.array("geoid_m", np.nan),
@@ -252,14 +250,14 @@ def _segment(line: _GeojsonLine, crs: str, reading: MapReading) -> Segment:
     )
 
 
-#: For each optional column: attribute of the track, conversion factor, and value for an empty cell.
+#: Optional columns: name of the `Track` attribute, conversion factor, and value of an empty cell.
 OPTIONAL_COLUMNS: Final[dict[str, tuple[str, float, float]]] = {
     "kilometrage_m": ("kilometrage_m", 1.0, np.nan),
     "cant_mm": ("cant_m", 1e-3, np.nan),
     "radius_m": ("radius_m", 1.0, np.inf),
     "gradient_permille": ("gradient_permille", 1.0, np.nan),
 }
-#: Columns with standard deviations of each point, for information; positioning uses the metadata of the whole map.
+#: Columns with standard deviations of each point, for information only. Positioning uses the metadata of the map.
 SIGMA_COLUMNS: Final = ("sigma_plan_m", "sigma_height_m")
 KNOWN_COLUMNS: Final = (
     "latitude_deg", "longitude_deg", "height_m", "elevation_m", "geoid_m", *OPTIONAL_COLUMNS, *SIGMA_COLUMNS,
@@ -269,9 +267,9 @@ KNOWN_METADATA: Final = ("name", "crs", "height_datum", "geoid", "sigma_plan_m",
 
 
 def attributes(read: Callable[[str, float], Floats | None]) -> dict[str, Floats]:
-    """Return the optional attributes of points in the units of `Track`; `read(column, blank)` returns a column.
+    """Return the optional attributes of points in the units of `Track`. `read(column, blank)` returns a column or None.
 
-    An attribute for which `read` returns None is left out. A radius of 0, for straight track, becomes infinite.
+    Attributes of missing columns are left out. A radius of 0, which means straight track, becomes infinite.
     """
     found: dict[str, Floats] = {}
     for column, (name, factor, blank) in OPTIONAL_COLUMNS.items():
@@ -299,7 +297,7 @@ def read_csv_segment(path: FilePath, reading: MapReading) -> Segment:
     place = _place(crs, latitude, longitude, path=table.path)
     geoid_m = table.numbers("geoid_m") if datum == "orthometric" and "geoid_m" in table else None
     above = None
-    if heights.any():  # heights that are all 0 count as missing, as in files of other formats
+    if heights.any():  # if all heights are 0, they count as missing
         above = heights_of_file(
             heights, place, replace(reading, crs=None, height_datum=datum), path=table.path,
             geoid=table.metadata.get("geoid"), geoid_m=geoid_m,
@@ -317,7 +315,7 @@ def read_csv_segment(path: FilePath, reading: MapReading) -> Segment:
 
 
 def _with_map_names(table: NamedColumns, height_datum: str | None) -> NamedColumns:
-    """Return the table with column names of other programs replaced by the names of railfix.
+    """Replace the column names of other programs by those that railfix uses.
 
     The height column is renamed according to the height datum. Raise InputFileError if the datum is not given.
     """
@@ -389,7 +387,7 @@ def check_degrees(table: NamedColumns, latitude_deg: Floats, longitude_deg: Floa
 
 
 def _place(crs: str | None, latitude: Floats, longitude: Floats, *, path: str) -> Georeference:
-    """Return the positions of latitudes and longitudes in a geographic CRS; WGS 84 if None.
+    """Return the georeference of latitudes and longitudes in a geographic CRS, by default WGS 84.
 
     Raise SettingsError if the CRS is not geographic or its unit is not the degree.
     """
@@ -408,10 +406,11 @@ def _place(crs: str | None, latitude: Floats, longitude: Floats, *, path: str) -
 
 
 def write_track_csv(track: Track, path: FilePath, *, sigma_m: Floats | None = None) -> None:
-    """Write a track as CSV with ellipsoidal heights; if writing fails, no file is left.
+    """Write a track as CSV with ellipsoidal heights.
 
-    Attributes without any value are omitted. Coordinates are written to 1e-10 degrees and 0.1 mm. `sigma_m` are
-    standard deviations of each point in plan and height, shape (V, 2) [m], which become additional columns.
+    Attributes without any value are omitted. Coordinates are written to 1e-10 degrees and 0.1 mm. `sigma_m`, shape (V,
+    2) [m], are the standard deviations of each point in plan and in height; they become additional columns. No file
+    remains if writing fails.
 
     Raises
     ------

@@ -21,18 +21,18 @@ from railfix.track.geometry import Geometry, compute_geometry, mean_gradients
 from railfix.track.track import BACKWARDS, HEIGHTS_M, Track, kilometrage_breaks
 
 Severity = Literal["error", "warning"]
-_COARSE_DEG: Final = 1e-5  #: Rounding of coordinates that is reported [deg]; it causes errors of up to 0.6 m.
-_LEAST_CANT_M: Final = 5e-4  #: If the largest cant of a map is below this, the unit must be wrong [m].
-_NEAR_DUPLICATE_M: Final = 0.10  #: Spacing below which two points are probably the same point measured twice [m].
+_COARSE_DEG: Final = 1e-5  #: Rounding step of coordinates that is reported; rounding errors reach 0.6 m [deg].
+_LEAST_CANT_M: Final = 5e-4  #: If the largest cant of a map is below this value, the unit must be wrong [m].
+_NEAR_DUPLICATE_M: Final = 0.10  #: Spacing below which two points are reported as one point measured twice [m].
 _CURVED_1PM: Final = 1 / 3000  #: Curvature below which the track counts as straight [1/m].
-_ADVERSE_M: Final = 0.005  #: Cant below which the sign of the cant is not checked [m].
-_CENTIMETRE_M: Final = 0.01  #: Largest distance between chord and arc for `needed_spacing_m` [m].
-#: Change of direction at a point above which the point is a kink, if the implied radius is also below `least_radius_m`.
+_ADVERSE_M: Final = 0.005  #: Absolute value of the cant up to which its sign is not checked [m].
+_CENTIMETRE_M: Final = 0.01  #: Largest distance between chord and arc at the spacing `needed_spacing_m` [m].
+#: A point is a kink if the direction changes by more than this angle and the radius is below `least_radius_m`.
 _KINK_DEG: Final = 3.0
 _SHARP_KINK_DEG: Final = 15.0  #: Change of direction up to which a kink is a warning; a sharper kink is an error.
-#: Largest deviation of the height of a point from the line through its neighbours.
+#: Largest accepted distance of a point above or below the line through its neighbours.
 _HEIGHT_SPIKE_M: Final = 0.50
-#: Largest difference between the mean gradients from the map and from the heights, over `_GRADIENT_WINDOW_M`.
+#: Largest accepted difference between the gradients from the map and from the heights, over `_GRADIENT_WINDOW_M`.
 _GRADIENT_DIFFERENCE_PERMILLE: Final = 5.0
 _GRADIENT_WINDOW_M: Final = 100.0
 
@@ -42,7 +42,7 @@ class MapLimits(Settings):
 
     #: Largest distance between chord and arc in mid-segment (P1 4.1(3)).
     mid_chord_m: float = Field(default=0.30, gt=0)
-    spacing_m: float = Field(default=50.0, gt=0)  #: Longest segment; tens of metres on straight track in P1 2.2(1).
+    spacing_m: float = Field(default=50.0, gt=0)  #: Longest segment; P1 2.2(1) has tens of metres on straight track.
     #: Length of a segment above which the segment is reported as a gap: a point is wrong, or a part of the line is
     #: missing.
     gap_m: float = Field(default=2000.0, gt=0)
@@ -53,7 +53,7 @@ class MapLimits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """Fault of the map in a range of consecutive points or segments."""
+    """Map fault in a range of consecutive points or segments."""
 
     severity: Severity
     kind: str  #: Kind of the fault: a key of `_FAULTS`, without the prefix "small ".
@@ -87,7 +87,7 @@ class TrackQuality(NotebookTable):
 
 
 def check_track(track: Track, *, limits: MapLimits | None = None) -> TrackQuality:
-    """Check the quality of a map, which should have been read with ``duplicates="keep"`` to report duplicate points."""
+    """Check the quality of a map; duplicate points are found only if the map was read with ``duplicates="keep"``."""
     check_type(track, Track, "track")
     limits = limits or MapLimits()
     geometry = compute_geometry(track)
@@ -103,7 +103,7 @@ def check_track(track: Track, *, limits: MapLimits | None = None) -> TrackQualit
 
 
 def error_note(quality: TrackQuality) -> tuple[str, ...]:
-    """Return a note with the number of errors of a map and the first error, or an empty tuple if there are none."""
+    """Return a note with the number of map errors and the first error, or an empty tuple if there are no errors."""
     if not quality.errors:
         return ()
     return (
@@ -149,7 +149,7 @@ _FAULTS: Final[dict[str, tuple[Severity, str]]] = {
     "cant": ("error", "cant of {value:.3f} m (limit {limit:g} m); check whether the column is in millimetres"),
     "small cant": (
         "error",
-        "cant of {value:.2g} m is the largest; check whether it is in metres, where millimetres are expected",
+        "the largest cant is {value:.2g} m; check whether it is in metres, where millimetres are expected",
     ),
     "cant side": (
         "error",
@@ -224,7 +224,7 @@ def _shape(track: Track, geometry: Geometry, limits: MapLimits) -> Iterator[Find
 
 
 def _cant_side(track: Track, geometry: Geometry) -> Iterator[Finding]:
-    """Yield the curves with negative cant.
+    """Yield a finding for each curve with negative cant.
 
     The findings are errors if all curves to one side have negative cant. Otherwise they are warnings, because negative
     cant is usual in turnouts.
@@ -240,7 +240,7 @@ def _cant_side(track: Track, geometry: Geometry) -> Iterator[Finding]:
 
 
 def needed_spacing_m(quality: TrackQuality) -> float:
-    """Return the spacing at which chords are within 1 cm of the sharpest curve [m]; infinite without curves."""
+    """Return the point spacing [m] at which all chords are within 1 cm of the arc; infinite without curves."""
     geometry = quality.geometry
     bend = np.where(np.isnan(geometry.map_curvature), geometry.point_curvature, geometry.map_curvature)
     sharpest = float(np.nanmax(np.abs(bend), initial=0.0))

@@ -53,13 +53,14 @@ def read_track(
     name : str, optional
         Name of the route; by default the name in the file, otherwise the file name.
     max_gap_m : float [m]
-        Widest accepted gap between the ends of two segments.
+        Widest gap between the ends of two segments that is bridged.
     sigma_plan_m, sigma_height_m : float, optional [m]
-        Accuracy of the map; by default as stated in the file, otherwise 0.30 m and 0.60 m (P1 4.1(3)).
+        Standard deviations of the map in plan and in height; by default the values stated in the file or, if the file
+        states none, 0.30 m and 0.60 m (P1 4.1(3)).
     duplicates : {"merge", "keep"}
         Whether equal consecutive points are merged, with a note, or kept for `railfix.track.check_track`.
     heights : path, optional
-        Source of heights for a map without heights; see `railfix.track.height_source.with_heights`.
+        File with heights for a map without heights; see `railfix.track.height_source.with_heights`.
 
     Returns
     -------
@@ -68,7 +69,7 @@ def read_track(
     Raises
     ------
     InputFileError
-        A file is not a valid track map; the message names line and cause.
+        A file is not a valid track map. The message states the line and the cause.
     SettingsError
         An option is unknown, missing, or contradicts the file.
     ValueError
@@ -103,7 +104,7 @@ def track_of_segments(
     max_gap_m: float = MAX_GAP_M,
     sigma_height_m: float | None = None,
 ) -> Track:
-    """Join segments to a track, with heights from `heights` if the segments have none; see `read_track`."""
+    """Join segments to a track, with heights from `heights` if the segments have no heights; see `read_track`."""
     check_heights(segments, heights, geoid=geoid, height_datum=height_datum, sigma_height_m=sigma_height_m)
     track = join(
         [replace(s, height_m=np.zeros(len(s.height_m))) if s.height_datum == NO_HEIGHTS else s for s in segments],
@@ -127,17 +128,17 @@ def check_heights(
 ) -> None:
     """Check that the heights come from either the segments or `heights`.
 
-    Raise InputFileError if neither has heights. Raise SettingsError if both have heights, or if options for a raster
+    Raise InputFileError if there are no heights. Raise SettingsError if both have heights, or if options for a raster
     are missing.
     """
     flat = [s for s in segments if s.height_datum == NO_HEIGHTS]
     if flat and heights is None:
         raise InputFileError(
             flat[0].source,
-            "the coordinates have no height; give heights (--heights), either `log` in railfix run, for the heights of "
-            "the log's own positions, or a file: a raster with height_datum (--height-datum), sigma_height_m "
-            "(--height-sigma) and, for orthometric heights, geoid (--geoid) "
-            f"({GEOIDS}); a profile by chainage; or a log of 3-D positions",
+            "the coordinates have no height; give heights (--heights): a profile by chainage; a log of 3-D positions; "
+            "`log`, in railfix run, for the heights of the log's own positions; or a raster with height_datum "
+            "(--height-datum), sigma_height_m (--height-sigma) and, for orthometric heights, geoid (--geoid) "
+            f"({GEOIDS})",
         )
     if heights is not None and len(flat) < len(segments):
         raise SettingsError(
@@ -148,9 +149,9 @@ def check_heights(
 
 
 def read_segments(file: FilePath, reading: MapReading) -> list[Segment]:
-    """Read the lines of one map file as segments, in the order of the file; see `read_track` for errors.
+    """Read the lines of one map file as segments, in the order of the file.
 
-    If a file has no heights, its segments have the height datum `NO_HEIGHTS`.
+    If a file has no heights, its segments have the height datum `NO_HEIGHTS`. Errors are listed in `read_track`.
     """
     segments = [_without_repeated(segment, reading) for segment in _read_segments(file, reading)]
     if (given := reading.sigma_plan_m) is not None:
@@ -164,9 +165,9 @@ def read_segments(file: FilePath, reading: MapReading) -> list[Segment]:
 
 
 def _without_repeated(segment: Segment, reading: MapReading) -> Segment:
-    """Return a segment without repeated consecutive points; raise InputFileError if fewer than two points remain.
+    """Return a segment without repeated consecutive points, unless `reading.duplicates` is "keep".
 
-    With duplicates "keep", the repeated points remain.
+    Raise InputFileError if the segment has fewer than two different points.
     """
     points = np.stack([segment.latitude_deg, segment.longitude_deg, np.nan_to_num(segment.height_m)])
     new = np.concatenate([[True], (np.diff(points) != 0.0).any(axis=0)])
@@ -187,9 +188,7 @@ def _with_usual_accuracy(segment: Segment, file: str) -> Segment:
 
 
 def _with_given_accuracy(segment: Segment, given_m: float) -> Segment:
-    """Return a segment with a given accuracy in plan, which is assumed to include the transformation from the map's
-    datum.
-    """
+    """Return a segment with a given accuracy in plan, which includes the accuracy of the datum transformation."""
     note = f"map: {given_m:g} m in plan (--plan-sigma) is better than the accuracy of the map's transformation"
     notes = [note] if segment.datum_plan_m > given_m else []
     return replace(_with_accuracy(segment, given_m, *notes), datum_plan_m=0.0)

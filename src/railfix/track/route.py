@@ -1,4 +1,4 @@
-"""Segments of track, which are read from files and joined to a route (P1 4.2(1))."""
+"""Segments of track that are read from files and joined to a route (P1 4.2(1))."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ATTRIBUTES = ("kilometrage_m", "cant_m", "radius_m", "gradient_permille")
 
 #: Column names, in lower case, by which ERA RINF files without track geometry are recognised.
 RINF_NAMES = ("sectionofline", "operationalpoint", "solopstart", "uniqueopid", "uopid", "opstart")
-#: Message on ERA RINF files without track geometry.
+#: Error message for ERA RINF files without track geometry.
 RINF_SECTIONS = (
     "sections of line and operational points of ERA RINF have no geometry of tracks; export the register's topology as "
     "RDF (.ttl, .rdf, .nt, .jsonld)"
@@ -52,7 +52,7 @@ class MapReading:
 
 @dataclass(frozen=True, kw_only=True)
 class Segment:
-    """Points of one file or feature with ellipsoidal heights, which are NaN if the file has none (`NO_HEIGHTS`)."""
+    """Points of one file or feature; the heights are ellipsoidal, or NaN if the file has no heights (`NO_HEIGHTS`)."""
 
     source: str  #: Name of the file, followed by the name of the feature if the file has several features.
     file: str  #: Name of the file.
@@ -60,7 +60,7 @@ class Segment:
     latitude_deg: Floats
     longitude_deg: Floats
     height_m: Floats
-    #: Attributes of the points as in `Track`, shape (n,); NaN where the file has none.
+    #: Attributes of the points as in `Track`, shape (n,); NaN where the file has no value.
     kilometrage_m: Floats
     cant_m: Floats
     radius_m: Floats
@@ -68,12 +68,12 @@ class Segment:
     crs: str  #: CRS of the file.
     height_datum: str  #: Height datum of the file.
     geoid: str  #: Geoid by which the heights were converted.
-    metadata: dict[str, str]  #: Name, accuracy and origin of the segment, as far as the file states them.
+    metadata: dict[str, str]  #: Name, accuracy and origin of the segment, if stated in the file.
     frame: str = "EPSG:4979"  #: Geographic CRS of the coordinates of the segment.
-    #: Standard deviation of the transformation of the coordinates in plan; NaN if unknown. It is added to the accuracy
-    #: of the map.
+    #: Standard deviation of the datum transformation in plan; NaN if unknown. It increases the standard deviation of
+    #: the map.
     datum_plan_m: float = 0.0
-    datum_height_m: float = 0.0  #: Standard deviation of the transformation of the heights; NaN if unknown.
+    datum_height_m: float = 0.0  #: Standard deviation of the datum transformation in height; NaN if unknown.
     notes: tuple[str, ...] = ()
     nodes: tuple[str, ...] = ()  #: OpenStreetMap node ids of the points; empty if the file has no node ids.
 
@@ -100,7 +100,7 @@ def make_segment(
 ) -> Segment:
     """Create a segment from coordinates in plan, heights, and attributes.
 
-    `heights` is None for a segment without heights. An attribute that is not given is NaN.
+    `heights` is None for a segment without heights. Attributes that are not given are NaN.
     """
     absent = np.full(len(place.latitude_deg), np.nan)
     of_points: dict[str, Any] = {**dict.fromkeys(ATTRIBUTES, absent), **attributes}
@@ -113,20 +113,18 @@ def make_segment(
     )  # fmt: skip
 
 
-SAME_POINT_M = 0.05  #: Distance below which the ends of two segments are the same point [m].
+SAME_POINT_M = 0.05  #: Distance below which the ends of two segments count as the same point [m].
 MAX_GAP_M = 1.0  #: Widest gap between the ends of two segments that is bridged by a straight line [m].
 
 
 def _ends(segments: Sequence[Segment]) -> Floats:
-    """Return the ECEF positions of each segment's first and last point, shape (n, 2, 3) [m]; missing heights count as
-    0.
-    """
+    """Return the ECEF positions of each segment's first and last point, shape (n, 2, 3) [m]."""
     columns = ("latitude_deg", "longitude_deg", "height_m")
     ends = np.array([[getattr(s, name)[[0, -1]] for name in columns] for s in segments])
     return ecef_from_geodetic(ends[:, 0], ends[:, 1], np.nan_to_num(ends[:, 2]))
 
 
-#: Largest fraction of points at which a line may turn by more than 90 degrees, for example where trains reverse.
+#: Largest accepted fraction of points at which the line turns by more than 90 degrees, as it does where trains reverse.
 _MOST_BACK: Final = 0.05
 
 
@@ -176,7 +174,8 @@ def _turn(ends: Floats, max_gap_m: float) -> list[bool]:
 
 
 def first_gap(segments: Sequence[Segment], *, max_gap_m: float = MAX_GAP_M) -> tuple[int, float] | None:
-    """Return the index of the first segment that does not meet the previous segment, and the gap [m]; None if all meet.
+    """Return the index of the first segment that does not meet the previous segment, and the gap [m], or None if all
+    segments meet.
 
     Segments meet if the gap between their ends is at most `max_gap_m`.
     """
@@ -239,9 +238,7 @@ def join(
 
 
 def one_frame(pieces: Sequence[Segment]) -> str:
-    """Return the reference frame of all pieces; raise MismatchError if frames differ, because steps of up to 2 m would
-    result.
-    """
+    """Return the common reference frame of all pieces; raise MismatchError if their frames differ."""
     frames = {piece.frame: piece.source for piece in pieces}
     if len(frames) > 1:
         what = "; ".join(f"{source} in {frame}" for frame, source in frames.items())
@@ -254,11 +251,11 @@ def _unique(values: Iterable[str]) -> tuple[str, ...]:
 
 
 def sigma_of_files(pieces: Sequence[Segment], key: str, default: float) -> float:
-    """Return the largest standard deviation of the pieces [m], including the transformation from the datum of each
-    piece.
+    """Return the largest standard deviation of the pieces [m], each including the standard deviation of its datum
+    transformation.
 
-    The standard deviation of a piece is stated in the metadata `key` of its file, or is `default` if the file states
-    none. Raise InputFileError if a value is not a positive number.
+    The standard deviation of a piece is the metadata entry `key` of its file, or `default` if the file has no such
+    entry. Raise InputFileError if an entry is not a positive number.
     """
     sigmas: list[float] = []
     for piece in pieces:

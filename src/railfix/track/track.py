@@ -19,14 +19,14 @@ from railfix.core.notebook import NotebookTable, plural
 
 SIGMA_PLAN_M = 0.30  #: Standard deviation of an aerial survey's centreline in plan [m] (P1 4.1(3)).
 SIGMA_HEIGHT_M = 0.60  #: Standard deviation of the centreline's height, about twice `SIGMA_PLAN_M` [m] (P1 4.1(3)).
-#: Note on a section whose points are joined in reverse order; it follows the name of the section.
+#: Text after the name of a section in the note that its points are joined in reverse order.
 BACKWARDS = "is used against the order of its points"
 UNNAMED = "not named (WGS 84 assumed)"  #: `Provenance.crs` of a map that names no reference system.
-#: A segment has a break if its length and its change of kilometrage differ by more than this plus a twentieth of the
-#: length [m].
+#: The kilometrage has a break in a segment if its change and the length of the segment differ by more than this value
+#: plus a twentieth of the length [m].
 KILOMETRAGE_BREAK_M = 1.0
-HEIGHTS_M = (-1000.0, 9000.0)  #: Range of ellipsoidal heights of railways, including tunnels below the sea [m].
-ANOTHER_PLACE_M = 100_000.0  #: Distance beyond which a log and a map count as from different locations [m].
+HEIGHTS_M = (-1000.0, 9000.0)  #: Range of accepted ellipsoidal heights, including tunnels below the sea [m].
+ANOTHER_PLACE_M = 100_000.0  #: Distance of a log from a map above which they are of different regions [m].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +39,7 @@ class Provenance:
     height_datum_asked: str = ""  #: Height datum given by the user, "ellipsoidal" or "orthometric"; "" if not given.
     height_datum_used: str = "ellipsoidal"  #: Height datum that was used.
     geoid: str = ""  #: Geoid model by which orthometric heights were converted to ellipsoidal heights; "" if not used.
-    notes: tuple[str, ...] = ()  #: Notes that must be in every result computed with this map.
+    notes: tuple[str, ...] = ()  #: Notes that are copied to every result computed with this map.
 
 
 class TrackFields(TypedDict, total=False):
@@ -101,10 +101,9 @@ class Track(NotebookTable):
     def from_geodetic(
         cls, latitude_deg: ArrayLike, longitude_deg: ArrayLike, height_m: ArrayLike, **attributes: Unpack[TrackFields]
     ) -> Track:
-        """Create a track from geodetic coordinates (WGS 84, ellipsoidal height), shape (V,).
+        """Create a track from latitudes, longitudes and ellipsoidal heights in WGS 84, shape (V,) each.
 
-        `attributes` are the fields of `TrackFields`; an attribute that is not given is NaN. Raise TypeError for other
-        names.
+        `attributes` are fields of `TrackFields`; point attributes default to NaN. Raise TypeError for other names.
         """
         if unknown := attributes.keys() - TrackFields.__annotations__.keys():
             raise TypeError(f"unknown attributes of a track: {', '.join(sorted(unknown))}")
@@ -132,7 +131,7 @@ class Track(NotebookTable):
 
     @classmethod
     def from_ecef(cls, ecef_m: ArrayLike, **attributes: Unpack[TrackFields]) -> Track:
-        """Create a track from ECEF points, shape (V, 3) [m]; attributes as in `from_geodetic`."""
+        """Create a track from ECEF points, shape (V, 3) [m]. The attributes are described in `from_geodetic`."""
         return cls.from_geodetic(*geodetic_from_ecef(ecef_m), **attributes)
 
     def __len__(self) -> int:
@@ -150,7 +149,7 @@ class Track(NotebookTable):
 
     @cached_property
     def chainage_m(self) -> Floats:
-        """Length of the polyline from its first point to each point, shape (V,) [m]; equal at duplicate points."""
+        """Length of the polyline from its first point to each point, shape (V,) [m]."""
         steps = np.linalg.norm(np.diff(self.ecef_m, axis=0), axis=1)
         return read_only(np.concatenate([[0.0], np.cumsum(steps)]))
 
@@ -162,22 +161,23 @@ class Track(NotebookTable):
 def kilometrage_breaks(chainage_m: Floats, kilometrage_m: Floats) -> Masks:
     """Return a mask of the segments in which the kilometrage has a break, shape (V - 1,).
 
-    There, length and change of kilometrage differ by more than `KILOMETRAGE_BREAK_M` plus a twentieth of the length.
+    At a break, the segment length and the change of kilometrage differ by more than `KILOMETRAGE_BREAK_M` plus a
+    twentieth of the length.
     """
     return _jumps(np.diff(chainage_m), np.diff(kilometrage_m))
 
 
 def _jumps(length_m: Floats, change_m: Floats) -> Masks:
-    """Return a mask of segments with a break, in the shape of the arguments; see `kilometrage_breaks`."""
+    """Return a mask of the segments that have a break, as defined in `kilometrage_breaks`."""
     return np.asarray(np.abs(np.abs(change_m) - length_m) > KILOMETRAGE_BREAK_M + 0.05 * length_m)
 
 
 def interpolate_kilometrage(chainage_m: ArrayLike, known_chainage_m: Floats, known_kilometrage_m: Floats) -> Floats:
     """Interpolate the kilometrage at chainages of any shape.
 
-    The result is NaN where the chainage is NaN, and where a point of the segment has no kilometrage. The kilometrage is
-    linear between two points, and is extrapolated beyond the ends. Within a segment that has a break, the kilometrage
-    is extrapolated from the nearer point, in the direction that it has on the same side of the break.
+    The result is NaN where the chainage is NaN, and where an end of the segment has no kilometrage. The interpolation
+    is linear between two points, with linear extrapolation beyond the ends of the line. In a segment with a break, the
+    kilometrage continues from the nearer end of the segment; it rises or falls as in the track adjacent to this end.
     """
     at = np.asarray(chainage_m, dtype=np.float64)
     last = len(known_chainage_m) - 2
@@ -197,7 +197,7 @@ def interpolate_kilometrage(chainage_m: ArrayLike, known_chainage_m: Floats, kno
 
 
 def _running_direction(kilometrage_m: Floats, broken: Masks) -> tuple[Floats, Floats]:
-    """Determine the direction of the kilometrage before and after each point, +1 (rising) or -1; shape (V,) each."""
+    """Return the direction of the kilometrage before and after each point, 1 if rising and -1 if falling."""
     sign = np.sign(np.diff(kilometrage_m))
     usable = ~broken & np.isfinite(sign) & (sign != 0)
     if not usable.any():

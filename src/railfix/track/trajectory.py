@@ -1,4 +1,4 @@
-"""Trajectory of an antenna: a polyline in ECEF, to which the antenna's position is constrained, with search."""
+"""Trajectory of an antenna as a polyline in ECEF, and search for the nearest points of the polyline."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from railfix.core.geodesy import axes_at
 from railfix.core.notebook import NotebookTable, plural
 from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Track, interpolate_kilometrage
 
-#: Number of candidate samples per position in the first round of the search. Each further round has four times as many,
-#: and only the positions for which a nearer point is still possible.
+#: Number of candidate samples per position in the first round of the search. Each further round uses four times as many
+#: candidates, for positions whose nearest point is not yet certain.
 _FIRST_CANDIDATES = 6
-_CHUNK = 2_000_000  #: Largest product of the numbers of positions and candidates in one array.
+_CHUNK = 2_000_000  #: Largest number of pairs of a position and a candidate in one array.
 
 
 def project_on_segments(points_m: Floats, start_m: Floats, step_m: Floats) -> tuple[Floats, Floats]:
-    """Return the nearest point of a segment as a fraction (0 to 1), and the distance to it; (..., 3) broadcast."""
+    """Project points on segments, and return the fractions (0 to 1) along the segments and the distances from them."""
     offset = points_m - start_m
     squared = np.einsum("...i,...i->...", step_m, step_m)
     share = np.minimum(np.maximum(np.einsum("...i,...i->...", offset, step_m) / squared, 0.0), 1.0)
@@ -32,7 +32,7 @@ def project_on_segments(points_m: Floats, start_m: Floats, step_m: Floats) -> tu
 
 
 class NearestOnPolyline:
-    """Search structure for nearest points of a polyline, shape (V, 3), with samples along the segments."""
+    """Search for nearest points of a polyline, shape (V, 3), by samples along the segments."""
 
     def __init__(self, points_m: Floats) -> None:
         self._start = points_m[:-1]
@@ -47,9 +47,9 @@ class NearestOnPolyline:
         self._tree = scipy.spatial.cKDTree(self._start[self._segment] + share[:, None] * self._step[self._segment])
 
     def __call__(self, ecef_m: ArrayLike) -> tuple[Indices, Floats, Floats]:
-        """Return, for positions (n, 3), the nearest segment and the distances along and from this segment, shape (n,).
+        """Return each position's nearest segment, and the position's distances along and from this segment.
 
-        For a position that is NaN, the segment is -1, and the distances are NaN.
+        Positions have shape (n, 3); the results have shape (n,). For NaN, the segment is -1 and the distances are NaN.
         """
         points = np.asarray(ecef_m, dtype=np.float64)
         if points.ndim != 2 or points.shape[1] != 3:
@@ -70,7 +70,7 @@ class NearestOnPolyline:
         return index, along, offset
 
     def _among(self, points: Floats, candidates: int) -> tuple[Indices, Floats, Floats, Masks]:
-        """Find the nearest segment among those of the nearest samples, and whether no other segment can be nearer."""
+        """Find the nearest of the segments with the nearest samples, and whether no other segment can be nearer."""
         nearest = self._tree.query(points, k=np.arange(1, candidates + 1))
         distance, sample = np.asarray(nearest[0], dtype=np.float64), np.asarray(nearest[1], dtype=np.intp)
         chosen, share, best = nearest_segments(points, self._segment[sample], self._start, self._step)
@@ -81,19 +81,19 @@ class NearestOnPolyline:
 def nearest_segments(
     points_m: Floats, segment: Indices, start_m: Floats, step_m: Floats
 ) -> tuple[Indices, Floats, Floats]:
-    """Find for each point (n, 3) the nearest of C candidate segments (n, C), the fraction along it and the distance."""
+    """Find each point's nearest segment among C candidates (n, C), the fraction along it, and the distance to it."""
     share, offset = project_on_segments(points_m[:, None], start_m[segment], step_m[segment])
     best = offset.min(axis=1)
-    # return the first of equally near segments on the line, whatever the order of the candidates
+    # of equally near segments, return the first on the line, whatever the order of the candidates
     place = np.where(offset <= best[:, None] * (1 + 1e-12) + 1e-9, segment + share, np.inf)
     row, column = np.arange(len(points_m)), place.argmin(axis=1)
     return segment[row, column], share[row, column], best
 
 
-#: Largest distance between the end of a closed line and another part of it [m]; a second track is farther away.
+#: Largest distance of a closed line's end from another part of the line [m]; parallel tracks are farther apart.
 _CLOSED_M: Final = 3.0
 _SAME_WAY: Final = 0.9  #: Cosine of the largest angle between two parts that count as parallel.
-_END_M: Final = 100.0  #: Parts of a line within this distance of its end, along the line, are not searched [m].
+_END_M: Final = 100.0  #: Length of the line next to its end that is not searched [m].
 
 
 def joins_m(arc_m: Floats, ecef_m: Floats) -> tuple[float, float]:
@@ -104,7 +104,7 @@ def joins_m(arc_m: Floats, ecef_m: Floats) -> tuple[float, float]:
 
 
 def _beside(arc_m: Floats, ecef_m: Floats, segment: Floats, end: int) -> float:
-    """Return the arc length of the nearest part of the line beside and parallel to an end [m]; NaN if there is none."""
+    """Return the arc length of the nearest part of the line that is parallel to an end [m]; NaN without one."""
     from_end = ecef_m[end] - ecef_m[:-1]
     length = np.diff(arc_m)
     along = np.clip((from_end * segment).sum(axis=1), 0.0, length)
@@ -117,7 +117,7 @@ def _beside(arc_m: Floats, ecef_m: Floats, segment: Floats, end: int) -> float:
 
 #: Note in every output of a run without a vehicle file.
 TRACK_AS_PATH = "no vehicle file: the track is assumed to be the antenna's own path"
-_END_TOLERANCE_M = 1e-6  #: Rounding allowed beyond the ends of a trajectory [m].
+_END_TOLERANCE_M = 1e-6  #: Accepted distance beyond the ends of a trajectory, for rounding errors [m].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,25 +130,25 @@ class Trajectory(FrozenArrays, NotebookTable):
     name: str  #: Name of the antenna, or of the track that is used as its path.
     ecef_m: Floats  #: ECEF coordinates of the points, shape (V, 3).
     chainage_m: Floats  #: Chainage of the reference point of the vehicle on the track, strictly rising, shape (V,).
-    kilometrage_m: Floats  #: Kilometrage at the reference point, shape (V,); NaN where the map has none.
-    cant_m: Floats  #: Cant of the track at the reference point, shape (V,); NaN where the map has none.
+    kilometrage_m: Floats  #: Kilometrage at the reference point, shape (V,); NaN where unknown.
+    cant_m: Floats  #: Cant of the track at the reference point, shape (V,); NaN where unknown.
     #: Roll of the car body, positive to the right, shape (V,); 0 if the track itself is used as the path.
     roll_deg: Floats
     reference: str = "antenna"  #: Reference point of the vehicle, to which `chainage_m` refers.
-    #: Chainage of the middle between the bogies when the antenna is at the point, strictly rising, shape (V,). This
-    #: chainage relates the positions of two antennas on one vehicle. None without a vehicle.
+    #: Chainage of the midpoint between the bogies when the antenna is at the point, strictly rising, shape (V,). It
+    #: relates the positions of two antennas on one vehicle. It is None without a vehicle.
     body_chainage_m: Floats | None = None
     facing: Literal["rising", "falling"] = "rising"  #: Direction of the vehicle's front along the line.
-    #: Distance of the antenna ahead of the middle between the bogies, toward the vehicle's front.
+    #: Distance of the antenna ahead of the midpoint between the bogies, toward the vehicle's front.
     antenna_ahead_m: float = 0.0
-    #: Distance of the vehicle's front end ahead of the middle between the bogies; None if unknown.
+    #: Distance from the midpoint between the bogies to the vehicle's front end; None if unknown.
     front_end_m: float | None = None
-    rear_end_m: float | None = None  #: Distance of the vehicle's rear end behind this middle; None if unknown.
-    #: Distance between the contact points of a wheelset, over which cant is measured; None without a vehicle.
+    rear_end_m: float | None = None  #: Distance from this midpoint to the vehicle's rear end; None if unknown.
+    #: Distance between the wheels' contact points, over which cant is measured; None without a vehicle.
     contact_m: float | None = None
     sigma_plan_m: float = SIGMA_PLAN_M  #: Standard deviation of the map in plan, used in the solution.
     sigma_height_m: float = SIGMA_HEIGHT_M  #: Standard deviation of the map in height, used in the solution.
-    notes: tuple[str, ...] = ()  #: Notes that must be in every result.
+    notes: tuple[str, ...] = ()  #: Notes that are copied to every result.
 
     def __post_init__(self) -> None:
         points = len(self.ecef_m)
@@ -166,13 +166,13 @@ class Trajectory(FrozenArrays, NotebookTable):
                 f"chainage_m must rise strictly; point {i + 1} at {self.chainage_m[i]:.3f} m repeats or runs back"
             )
         if not (self.length_m > 0).all():
-            raise ValueError(f"points {int(np.argmin(self.length_m))} and the next are equal")
+            raise ValueError(f"point {int(np.argmin(self.length_m))} and the next point are equal")
 
     @classmethod
     def from_antenna_path(cls, track: Track) -> Trajectory:
-        """Create a trajectory from a map that is itself the path of an antenna; `notes` records this.
+        """Create a trajectory from a map that is itself the path of an antenna; a note states this assumption.
 
-        In curves, the path of a train's antenna differs from the track; `antenna_trajectory` computes this path.
+        In curves, the antenna's path differs from the track. `antenna_trajectory` computes the antenna's path.
         """
         check_type(track, Track, "track")
         return cls(
@@ -264,9 +264,8 @@ class Trajectory(FrozenArrays, NotebookTable):
     def segment_at(self, arc_m: ArrayLike) -> tuple[Indices, Floats]:
         """Return the segment at each arc length, of any shape, and the distance along the segment [m].
 
-        A point shared by two segments belongs to the later segment. Before the start, the result is the first segment
-        with a negative distance. Beyond the end, the result is the last segment. For NaN, it is the last segment with
-        the distance NaN.
+        A point shared by two segments belongs to the later one. Before the start, the first segment and a negative
+        distance are returned; beyond the end, the last segment; for NaN, the last segment and NaN.
         """
         arc = np.asarray(arc_m, dtype=np.float64)
         index = np.minimum(np.maximum(self.arc_m.searchsorted(arc, side="right") - 1, 0), len(self) - 2)
@@ -286,7 +285,7 @@ class Trajectory(FrozenArrays, NotebookTable):
         return self._interpolate(arc_m, self.chainage_m)
 
     def body_at(self, arc_m: ArrayLike) -> Floats:
-        """Interpolate the chainage of the middle between the bogies at antenna arc lengths [m].
+        """Interpolate the chainage of the midpoint between the bogies [m] at antenna arc lengths [m].
 
         The result is NaN without a vehicle, beyond the ends, and for NaN input.
         """
@@ -295,7 +294,7 @@ class Trajectory(FrozenArrays, NotebookTable):
         return self._interpolate(arc_m, self.body_chainage_m)
 
     def arc_of_body(self, body_chainage_m: ArrayLike) -> Floats:
-        """Interpolate the antenna's arc length at chainages of the middle between the bogies [m].
+        """Interpolate the antenna's arc length [m] at chainages of the midpoint between the bogies [m].
 
         The result is NaN without a vehicle, beyond the ends, and for NaN input.
         """
@@ -313,21 +312,22 @@ class Trajectory(FrozenArrays, NotebookTable):
         return np.where(inside, np.interp(chainage, self.chainage_m, self.arc_m), np.nan)
 
     def kilometrage_at(self, arc_m: ArrayLike) -> Floats:
-        """Interpolate the kilometrage at arc lengths [m], but not across a break; NaN where the map has none."""
+        """Interpolate the kilometrage at arc lengths, except across breaks [m]; NaN where unknown."""
         return interpolate_kilometrage(self.chainage_at(arc_m), self.chainage_m, self.kilometrage_m)
 
     def nearest(self, ecef_m: ArrayLike) -> tuple[Floats, Floats]:
-        """Return the arc length of the nearest point to each position (n, 3), and the distance to it, shape (n,) [m].
+        """Return each position's nearest point as an arc length, and the distance to this point, shape (n,) each [m].
 
-        The search is exact: a k-d tree provides candidate segments, and a bound excludes all others. Of two equally
-        near points, the point with the smaller arc length is returned. Both results are NaN where the position is NaN.
+        Positions have shape (n, 3). The search is exact: a k-d tree provides candidates, and a bound excludes all other
+        segments. Of equally near points, the first on the line is returned. Both results are NaN where the position is
+        NaN.
         """
         index, along, offset = self._nearest(ecef_m)
         return self.arc_m[np.maximum(index, 0)] + along, offset  # `along` is NaN where no segment was found
 
 
 def between_points(arc: Floats, arc_m: Floats, length_m: Floats, values: Floats, section: Indices) -> Floats:
-    """Interpolate values (V, ...) of a line at arc lengths on given segments; NaN beyond the ends of the segments."""
+    """Interpolate values (V, ...) at arc lengths on the segments `section`; NaN beyond the ends of these segments."""
     length = length_m[section]
     share, beyond = (arc - arc_m[section]) / length, _END_TOLERANCE_M / length
     share = np.where((share < -beyond) | (share > 1.0 + beyond), np.nan, share)

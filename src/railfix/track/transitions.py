@@ -22,8 +22,8 @@ from railfix.core.arrays import Floats
 
 Shape = Literal["cubic", "half-sine"]
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
-#: Number of intervals for the quadrature of the length. With 12 nodes in each interval, the length is exact to
-#: rounding.
+#: Number of intervals for the numerical integration of the length. With 12 nodes in each interval, the length is exact
+#: except for rounding errors.
 _PIECES: Final = 16
 _ROUNDS: Final = 30  #: Number of fixed-point iterations for the length on the tangent; ten are enough to converge.
 _HALF_SINE_END: Final = 0.25 - 1.0 / np.pi**2  #: Value of y R / X^2 at the end of a half-sine.
@@ -42,7 +42,7 @@ class OrdinateElement:
     into: bool = True  #: Whether the first point is the straight end.
 
     def _ordinates(self, x: Floats) -> tuple[Floats, Floats, Floats]:
-        """Return the ordinates [m] at abscissae x [m], and their first and second derivatives with respect to x."""
+        """Return the ordinates y [m] at abscissae x [m], and the derivatives dy/dx and d2y/dx2."""
         share, end, size = x / self.tangent_m, self.ordinate_m, self.tangent_m
         if self.shape == "cubic":
             return end * share**3, 3.0 * end / size * share**2, 6.0 * end / size**2 * share

@@ -41,7 +41,7 @@ _OTHERS: Final = (
     "miniature", "planned", "platform", "platform_edge", "proposed", "razed", "removed", "station", "traverser",
     "turntable", "yard",
 )  # fmt: skip
-#: Columns that can contain the id of a feature; only OpenStreetMap export programs write the first four.
+#: Columns that can contain the id of a feature. The first four are written only by OpenStreetMap export programs.
 _IDS: Final = ("osm_id", "osmid", "osm_way_id", "full_id", "@id", "id")
 _KINDS: Final = ("@type", "osm_type", "element_type", "element", "type")
 _ID: Final = re.compile(r"[^\w-]*(way|relation|[wr])?[^\w-]*(-?\d+)\)?")
@@ -49,7 +49,7 @@ _HSTORE: Final = re.compile(r'"((?:[^"\\]|\\.)*)"=>"((?:[^"\\]|\\.)*)"')
 
 
 CROSSING: Final = "x"  #: Prefix of the id of a node at which tracks cross without a connection.
-_LEFT_OUT: Final = "@left out"  #: Key of the reason why a way with valid tags is left out.
+_LEFT_OUT: Final = "@left out"  #: Key in `Way.row` for the reason why a way with valid tags is left out.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,9 +92,9 @@ def is_of_openstreetmap(row: Mapping[str, Any]) -> bool:
 
 
 def no_track(row: Mapping[str, Any], *, of_openstreetmap: bool) -> str:
-    """Return the reason why a feature is not a track in use; "" for a track.
+    """Return the reason why a feature is not a track in use, or "" if it is a track in use.
 
-    A feature from OpenStreetMap must have the tag of a railway in use.
+    Features from OpenStreetMap must have the tag of a railway in use; other features need no tag.
     """
     if row.get(_LEFT_OUT):
         return str(row[_LEFT_OUT])
@@ -108,8 +108,8 @@ def no_track(row: Mapping[str, Any], *, of_openstreetmap: bool) -> str:
 def get_metadata(row: Mapping[str, Any]) -> dict[str, str]:
     """Return the origin, name ("way/7 Main Line") and non-zero level of a feature from OpenStreetMap.
 
-    Without an id, there is no name and no level. A feature that is not recognised as from OpenStreetMap has an origin
-    only if it has the tag of a railway in use.
+    Name and level require an id. If a feature is not recognised as from OpenStreetMap, only the origin is returned,
+    provided that the feature has the tag of a railway in use.
     """
     tags = get_tags(row)
     if not is_of_openstreetmap(row):
@@ -124,7 +124,7 @@ def get_metadata(row: Mapping[str, Any]) -> dict[str, str]:
 
 
 def find_level(tags: Mapping[str, Any]) -> int:
-    """Return the level of a way, from the tags layer, bridge and tunnel; 0 on the ground."""
+    """Return the level of a way from the tags layer, bridge and tunnel; the ground has level 0."""
     try:
         return int(str(tags.get("layer") or ""))
     except ValueError:
@@ -133,7 +133,7 @@ def find_level(tags: Mapping[str, Any]) -> int:
 
 
 def with_left_out(path: FilePath, segments: list[Segment], reasons: Counter[str]) -> list[Segment]:
-    """Return the segments of a file, with a note in the first segment on lines that were left out.
+    """Add a note on lines that were left out to the first segment, and return the segments.
 
     Raise InputFileError if there is no segment.
     """
@@ -175,7 +175,7 @@ def read_osm_xml(path: FilePath) -> list[Way]:
 
 
 def _is_crossing(tags: Mapping[Any, Any]) -> bool:
-    """Return whether a node is a crossing of tracks without a connection; a slip has a connection."""
+    """Return whether a node is a crossing of tracks without a connection (no slip)."""
     return tags.get("railway") == "railway_crossing" and not tags.get("railway:switch")
 
 
@@ -216,10 +216,10 @@ def _ways(
     nodes: Mapping[str, tuple[float, float]],
     crossings: Set[str],
 ) -> list[Way]:
-    """Return ways with points; a way that is partly outside the extract is divided into parts.
+    """Return ways with points; a way that is partly outside the file's area is divided into parts.
 
-    A way without two successive known points is returned without points, and with a reason (`_LEFT_OUT`). Raise
-    InputFileError if no way has two points.
+    A way without two successive known points is returned without points, but with a reason (`_LEFT_OUT`). Raise
+    InputFileError if no way has two successive points.
     """
     found, short = [], []
     for row, refs in ways:
@@ -246,8 +246,8 @@ _NAMES: Final = ("name", "id", "track_id", "line", "osm_id", "@id", "fid")
 def read_layers(path: FilePath, *, geometry: str) -> list[tuple[str | None, list[dict[str, Any]], Any]]:
     """Read the features of each layer of a file through GDAL.
 
-    Return for each layer the CRS, the properties of the features, and their geometries. Only features with a geometry
-    type that ends with `geometry` ("LineString") are read. For "none", all features are read, without geometry. Raise
+    Return the CRS of each layer, and the properties and geometries of its features. Only features whose geometry type
+    ends with `geometry` ("LineString") are read. If `geometry` is "none", all features are read without geometry. Raise
     InputFileError if GDAL cannot read the file.
     """
     with needs_extra(f"{path}: {KIND_WORDS[find_kind(path)]}"):
@@ -281,7 +281,7 @@ def read_layers(path: FilePath, *, geometry: str) -> list[tuple[str | None, list
 
 
 def read_vector_segments(path: FilePath, reading: MapReading) -> list[Segment]:
-    """Read the lines of a map file as segments; options of `reading` apply where the file does not state them.
+    """Read the lines of a map file as segments; `reading` has the options that the file does not state.
 
     Raise InputFileError if the file has no track, or a line is not valid.
     """
@@ -325,7 +325,7 @@ def _features(
 
 
 def _accuracy(row: Mapping[str, Any]) -> dict[str, str]:
-    """Return, as metadata, the standard deviations that are given in the attributes of a feature."""
+    """Return the standard deviations that are stated in the attributes of a feature, as metadata."""
     keys = ("sigma_plan_m", "sigma_height_m")
     return {key: str(row[key]) for key in keys if row.get(key) is not None and row[key] == row[key]}
 
@@ -342,7 +342,7 @@ def plan_segment(
     """Create a segment from coordinates in easting-northing or longitude-latitude order, shape (n, 2) or (n, 3).
 
     Points that repeat the previous point in plan are left out. If all heights are 0, they count as missing. Raise
-    InputFileError if fewer than two points are left, some heights are missing, or coordinates are not valid.
+    InputFileError if fewer than two points remain, only some heights are missing, or coordinates are not valid.
     """
     source = f"{path} ({name})"
     if not np.isfinite(coordinates[:, :2]).all():
@@ -373,7 +373,7 @@ def plan_segment(
 
 
 def get_name(row: Mapping[str, Any], *, fallback: str) -> str:
-    """Return the name of a feature from the first of the columns `_NAMES` that has a value; otherwise `fallback`."""
+    """Return the name of a feature from the first column of `_NAMES` that has a value, otherwise `fallback`."""
     lower = {key.lower(): value for key, value in row.items()}
     for key in _NAMES:
         value = lower.get(key)

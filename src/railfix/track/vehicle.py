@@ -1,4 +1,4 @@
-"""Vehicle with two bogies and roof antennas, and the trajectories of its antennas (P1 3.1(1)).
+"""Trajectories of roof antennas on a vehicle with two bogies (P1 3.1(1)).
 
 The origin of the vehicle frame is midway between the bogie centres at the height of the rail tops. ``along_m`` points
 toward the vehicle's front, ``across_m`` to the right, and ``up_m`` perpendicular to the floor.
@@ -25,14 +25,14 @@ from railfix.track.trajectory import Trajectory, joins_m
 
 Reference = Literal["antenna", "centre", "front_bogie", "rear_bogie"]
 
-#: Distance between the contact points of both wheels minus the gauge; about the width of a rail head [m].
+#: Distance between the contact points of an axle's wheels, minus the gauge; about the width of a rail head [m].
 RAIL_HEAD_M: Final = 0.070
 PATH_TOLERANCE_M: Final = 0.004  #: Largest deviation of the antenna's path from the chord between two points [m].
 _INNER: Final = np.array([0.25, 0.5, 0.75])  #: Fractions of a segment at which the chord is compared with the path.
 #: Shortest segment of the path [m].
 _SHORTEST_M: Final = 0.25
 _MAX_ITERATIONS: Final = 200
-_CONVERGED_M: Final = 1e-7  #: Change at which iterations end [m].
+_CONVERGED_M: Final = 1e-7  #: Iterations end when the result changes by less than this value [m].
 
 
 class AntennaOffset(Settings):
@@ -55,7 +55,7 @@ class Vehicle(Settings):
     facing: Literal["rising", "falling"] = "rising"  #: Direction of the vehicle's front along the chainage.
     #: Length over the ends (buffers or couplers); None where unknown.
     length_m: float | None = Field(default=None, gt=0.0, le=1000.0)
-    #: Distance of the front end ahead of the middle between the bogies; half of `length_m` if None.
+    #: Distance from the midpoint between the bogies to the front end; if None, half of `length_m`.
     front_end_m: float | None = Field(default=None, ge=0.0, le=1000.0)
     antennas: dict[Literal["front", "rear"], AntennaOffset] = Field(min_length=1)  #: Positions of the antennas by name.
 
@@ -85,7 +85,7 @@ class Vehicle(Settings):
 def read_vehicle(path: FilePath) -> Vehicle:
     """Read a vehicle file (TOML).
 
-    Raise InputFileError if the file does not exist or is not TOML, SettingsError if a key is unknown, missing or out of
+    Raise InputFileError if the file is missing or not TOML, and SettingsError if a key is unknown, missing or out of
     range.
     """
     return load_settings(Vehicle, path, what="a vehicle file")
@@ -109,7 +109,7 @@ class Body:
 
 
 class _VehicleLine:
-    """Centreline, and roll due to cant, as functions of chainage; a closed line continues beyond its ends."""
+    """Centreline and roll due to cant, as functions of chainage; a closed line continues beyond its ends."""
 
     def __init__(self, track: Track, contact_spacing_m: float) -> None:
         self.chainage = track.chainage_m
@@ -160,7 +160,7 @@ class _VehicleLine:
 
 
 def _sign_cant(track: Track) -> tuple[Floats, tuple[str, ...]]:
-    """Return the signed cant, positive for roll to the right, shape (V,) [m], and notes.
+    """Return the cant, positive for roll to the right, shape (V,) [m], and notes.
 
     The sign follows from the map's radius or, where the map has no radius, from the bend of the points. On straight
     track, the sign follows from the nearest curve. Raise MismatchError if there is cant but no curve.
@@ -199,7 +199,7 @@ def _side_of_bends(track: Track) -> Floats:
 
 
 def _bogies(line: _VehicleLine, middle: Floats, distance_m: float, track: Track) -> tuple[Floats, Floats]:
-    """Return the chainages of both bogies [m], equally far from `middle`; the chord between both is `distance_m`."""
+    """Return the chainages of both bogies [m], which are symmetric about `middle` and have a chord of `distance_m`."""
     half = np.full(len(middle), distance_m / 2.0)
     active = np.arange(len(middle))
     for _ in range(_MAX_ITERATIONS):
@@ -246,7 +246,7 @@ def _place(body: Body, vehicle: Vehicle, offset: AntennaOffset) -> Floats:
 
 
 def _abeam(line: _VehicleLine, body: Body, antenna: Floats, along_m: float) -> Floats:
-    """Return the chainage of the centreline point that is abeam the antenna, in the plane across the body [m]."""
+    """Return the chainage at which the centreline crosses the plane through the antenna and across the body [m]."""
     chainage = (body.lower_m + body.upper_m) / 2.0 + along_m
     for _ in range(_MAX_ITERATIONS):
         ahead = np.einsum("vi,vi->v", line.at(chainage) - antenna, body.forward)
@@ -292,9 +292,9 @@ def _refine(line: _VehicleLine, track: Track, vehicle: Vehicle, offset: AntennaO
 
 
 def _end_halves(line: _VehicleLine, track: Track, vehicle: Vehicle) -> tuple[float, float]:
-    """Return the distance of the body's middle from each end of the track [m] when the outer bogie is at this end.
+    """Return the distance [m] from each end of the track to the body's middle when a bogie is at this end.
 
-    The distance is 0 at an end at which a closed track continues.
+    The distance is 0 at an end where a closed track continues.
     """
     first, last = 0.0, line.chainage[-1]
     half = np.where(line.open_ends, vehicle.bogie_distance_m / 2.0, 0.0)
@@ -315,9 +315,9 @@ def antenna_trajectory(
 
     Both bogie centres are on the centreline, with the bogie distance as chord. At each bogie, the track rolls by
     ``asin(cant / contact spacing)`` toward the inside of the curve; the body rolls by the mean of both rolls (P1
-    3.1(1)). The forward axis of the body joins the bogie centres; its up axis is the vertical rotated by the roll. The
-    path begins and ends where a bogie reaches an end of the track. On a closed track, the path begins and ends where
-    the body's middle is at the ends of the map, so that the path is also closed.
+    3.1(1)). The forward axis of the body joins the bogie centres. The up axis is perpendicular to the forward axis, and
+    rotated from the vertical by the roll. The path begins and ends where a bogie reaches an end of the track. On a
+    closed track, the path is closed: it begins and ends where the body's middle is at the ends of the map.
 
     Parameters
     ----------
@@ -332,8 +332,8 @@ def antenna_trajectory(
     Returns
     -------
     Trajectory
-        Path with a point for each point of the track that the body's middle passes, and further points where the path
-        would deviate from a chord by more than `PATH_TOLERANCE_M`.
+        Path with one point for each track point that the body's middle passes, and further points that keep the path
+        within `PATH_TOLERANCE_M` of its chords.
 
     Raises
     ------

@@ -187,7 +187,7 @@ def _graph(path: FilePath) -> Graph:
 
 @lru_cache(maxsize=2)
 def _parse(path: str, _: str) -> Graph:
-    """Return the triples of a file; they are cached, because segments and relations are read in separate calls."""
+    """Return the triples of a file. They are cached because segments and relations are read in separate calls."""
     with needs_extra(f"{path}: RDF"):
         from rdflib import Graph
     data = read_bytes(path)
@@ -199,7 +199,7 @@ def _parse(path: str, _: str) -> Graph:
             warnings.simplefilter("ignore", DeprecationWarning)  # the warnings concern rdflib's own classes
             return Graph().parse(data=data, format=name)
     except Exception as error:  # noqa: BLE001 - each rdflib parser raises its own errors
-        raise InputFileError(path, f"this is no {name} ({str(error).splitlines()[0]})") from None
+        raise InputFileError(path, f"this is not valid {name} ({str(error).splitlines()[0]})") from None
 
 
 def _all(graph: Graph, kind: str) -> list[Any]:
@@ -215,6 +215,6 @@ def _values(graph: Graph, subject: Any, predicate: str) -> list[Any]:
 
 
 def _name(graph: Graph, subject: Any) -> str:
-    """Return the label of a resource; without a label, the last part of the resource's address."""
+    """Return the label of a resource, or the last part of the resource's address if it has no label."""
     labels = _values(graph, subject, _LABEL)
     return str(labels[0]) if labels else re.split(r"[/#]", str(subject))[-1]

@@ -1,1 +1,1 @@
-"""Track maps from several runs of ordinary receivers, by adjustment of the positions of all runs to one line."""
+"""Track maps from several runs with ordinary receivers: all positions are adjusted to one line."""

@@ -14,21 +14,20 @@ from railfix.core.geodesy import range_with_rotation
 from railfix.track.survey.passes import Ties
 from railfix.track.survey.runs import CLIMB_MPS2, RunSignals, SurveyLimits, SurveyRun
 
-#: Standard deviation of the second difference of the line relative to the reference line [m]. Across the line, the
-#: standard deviation is larger by `_CORNER_M` times the squared turn [rad], because at a corner a lateral shift bends
-#: the line.
+#: Standard deviation of the second difference of the line's shifts from the reference line [m]. Across the line, it is
+#: larger by `_CORNER_M` times the squared turn [rad], because at a corner a lateral shift bends the line.
 _BEND_M: Final = 0.05
 _CORNER_M: Final = 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceLine:
-    """Line before the adjustment, J points."""
+    """Line of J points before the adjustment."""
 
     ecef_m: Floats  #: ECEF positions of the points, shape (J, 3).
     across: Floats  #: Unit vectors across the line, along which points are adjusted, shape (J, 3).
     up: Floats  #: Upward unit vectors, along which points are adjusted, shape (J, 3).
-    closed: bool = False  #: Whether the last point is joined to the first.
+    closed: bool = False  #: Whether the last point is joined to the first point.
 
     def __len__(self) -> int:
         return len(self.ecef_m)
@@ -36,7 +35,7 @@ class ReferenceLine:
 
 @dataclass(frozen=True, kw_only=True)
 class Equations:
-    """Equations of one kind: n observations of `size` rows each, divided by their standard deviations."""
+    """Equations of n observations with `size` rows each; each row is divided by its standard deviation."""
 
     matrix: sp.csr_array  #: Design matrix, shape (n * size, unknowns).
     value: Floats  #: Observed values, shape (n * size,).
@@ -52,13 +51,13 @@ class RunColumns:
 
     row: Indices  #: First of three columns of each row's coordinates.
     offset: int  #: First of three columns of the run's offset.
-    clock: Indices  #: Column of the receiver clock at each row.
-    further: Indices  #: Columns of the clock offsets of further constellations.
-    step: Indices  #: Column of the clock change in each step between rows.
+    clock: Indices  #: Column of the receiver clock error at each row.
+    further: Indices  #: Columns of the clock offsets of the other constellations.
+    step: Indices  #: Column of the change of receiver clock error in each step between rows.
 
     @classmethod
     def from_first(cls, run: SurveyRun, first: int) -> RunColumns:
-        """Assign the columns of a run's unknowns, from the column `first` on."""
+        """Assign columns to a run's unknowns, beginning with the column `first`."""
         count, signals = len(run), run.signals
         offset = first + 3 * count
         rows, further = (0, 0) if signals is None else (count, int(signals.clock.max(initial=0)))
@@ -73,14 +72,15 @@ class RunColumns:
 
     @property
     def end(self) -> int:
-        """First column after the run's columns."""
+        """Next column after the run's columns."""
         return self.offset + 3 + len(self.clock) + len(self.further) + len(self.step)
 
 
 def _matrix(size: int, unknowns: int, parts: Sequence[tuple[Indices, Floats]]) -> sp.csr_array:
     """Build a sparse matrix from parts.
 
-    A part has one column index per observation, shape (n,), and the coefficients of this column, shape (n, size).
+    A part consists of one column index per observation, shape (n,), and the coefficients in this column, shape (n,
+    size).
     """
     count = len(parts[0][0])
     row = np.arange(count * size)
@@ -91,14 +91,14 @@ def _matrix(size: int, unknowns: int, parts: Sequence[tuple[Indices, Floats]]) -
 
 
 def _point(first: Indices, factor: Floats) -> list[tuple[Indices, Floats]]:
-    """Return the parts of `_matrix` for coordinates in three columns from `first` on; `factor` is (n, size, 3)."""
+    """Return parts of `_matrix` for coordinates in three columns, the first of which is `first`."""
     return [(first + axis, factor[:, :, axis]) for axis in range(3)]
 
 
 def position_equations(
     run: SurveyRun, columns: RunColumns, axes: Floats, origin: Floats, share: Floats, unknowns: int
 ) -> Equations:
-    """Return the equations of measured positions, each the sum of the row's coordinates and the run's offset."""
+    """Return the equations of positions; a position is the sum of the row's coordinates and the run's offset."""
     rows = np.flatnonzero(np.isfinite(run.ecef_m).all(axis=1))
     white = axes[None] / run.sigma_m[rows][:, :, None]
     value = np.einsum("nij,nj->ni", white, run.ecef_m[rows] - origin)
@@ -113,7 +113,7 @@ def code_equations(
 ) -> Equations:
     """Return the equations of pseudoranges.
 
-    Unknowns are the coordinates, the run's offset, the clock of the row, and a clock offset per further constellation.
+    Unknowns are the coordinates, the run's offset, the row's clock error, and a clock offset per other constellation.
     """
     row, sigma = signals.row, signals.sigma_m
     distance, sight = range_with_rotation(signals.sat_ecef_m, near[row] + origin)
@@ -136,7 +136,7 @@ def change_equations(
 ) -> list[Equations]:  # fmt: skip
     """Return the equations of range changes by carrier phase, and by Doppler where the phase was lost.
 
-    Unknowns are the coordinates of both rows, and a clock change per step.
+    Unknowns are the coordinates of both rows, and the change of clock error in each step.
     """
     step, sigma = signals.step, signals.change_sigma_m
     before, sight_before = range_with_rotation(signals.before_ecef_m, near[step] + origin)
@@ -156,9 +156,9 @@ def change_equations(
 
 
 def _group_medians(value: Floats, group: Indices) -> Floats:
-    """Return, for each value, the median of its group.
+    """Return the median of each value's group.
 
-    The median is an approximate clock, so that only a small clock remains to be estimated.
+    The median is an approximate clock error, so that only a small clock error remains to be estimated.
     """
     order = np.lexsort((value, group))
     first = np.searchsorted(group[order], np.arange(int(group.max(initial=-1)) + 2))
@@ -169,7 +169,7 @@ def _group_medians(value: Floats, group: Indices) -> Floats:
 def motion_equations(
     run: SurveyRun, columns: RunColumns, axes: Floats, limits: SurveyLimits, unknowns: int
 ) -> Equations:  # fmt: skip
-    """Return the pseudo-observations of smooth motion: the velocity changes little between successive steps."""
+    """Return the pseudo-observations of smooth motion: small velocity changes between successive steps."""
     dt = np.diff(run.seconds)
     rows = np.arange(1, len(run) - 1)
     mean = 0.5 * (dt[:-1] + dt[1:])
@@ -200,7 +200,7 @@ def tie_equations(
     line: ReferenceLine, ties: Ties, runs: Sequence[RunColumns], start: int, origin: Floats, limits: SurveyLimits,
     unknowns: int,
 ) -> Equations:  # fmt: skip
-    """Return the equations of passes, at which a run is on the line up to an error correlated along the line."""
+    """Return the equations of passes: a run's distance from the line is an error that is correlated along the line."""
     share = np.full(len(ties.point), min(1.0, limits.spacing_m / max(limits.correlation_m, 1e-9)))
     white = np.stack([line.across[ties.point], line.up[ties.point]], axis=1) / limits.apart_m
     first = np.array([columns.row[0] for columns in runs])[ties.run]
@@ -216,7 +216,7 @@ def tie_equations(
 
 
 def bend_equations(line: ReferenceLine, start: int, unknowns: int) -> Equations:
-    """Return the pseudo-observations of a smooth line, whose bends differ little from the reference line."""
+    """Return the pseudo-observations of a smooth line, whose bends differ little from those of the reference line."""
     count = len(line)
     middle = np.arange(count) if line.closed else np.arange(1, count - 1)
     neighbours = line.across[(middle - 1) % count], line.across[(middle + 1) % count]

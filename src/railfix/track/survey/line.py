@@ -1,4 +1,4 @@
-"""Survey of a line: adjustment of several runs of ordinary receivers to one map with standard deviations.
+"""Survey of a line: adjustment of several runs with ordinary receivers to one map with standard deviations.
 
 Errors are assumed to follow Student's t distribution, for which the adjustment uses iteratively reweighted least
 squares (Lange, Little and Taylor 1989).
@@ -35,30 +35,29 @@ from railfix.track.survey.runs import SurveyLimits, SurveyRun
 from railfix.track.track import Provenance, Track
 
 _ADJUSTMENT_ROUNDS: Final = 15  #: Largest number of reweighting iterations.
-_SETTLED_M: Final = 0.02  #: Change of the solution at which the iterations end [m].
+_SETTLED_M: Final = 0.02  #: The iterations end when the solution changes by less than this value [m].
 #: Median of the norm of one, two and three standard normal variables.
 _MEDIAN: Final = {1: 0.6745, 2: 1.1774, 3: 1.5382}
-#: Limits of the factor that scales stated standard deviations. The factor must not become too small, because residuals
-#: do not show errors common to all satellites.
+#: Limits of the factor that scales stated standard deviations. The lower limit is necessary because residuals do not
+#: show errors that are common to all satellites.
 _SCALES: Final = (0.5, 10.0)
-_ANYWHERE_M: Final = 1e5  #: Standard deviation of a loose prior of every unknown, for conditioning [m].
-#: Largest number of points whose standard deviations are computed; between these points they are interpolated.
+_ANYWHERE_M: Final = 1e5  #: Standard deviation of the loose prior of each unknown, for conditioning [m].
+#: Largest number of points for which standard deviations are computed; the values of other points are interpolated.
 _SIGMAS: Final = 200
-_COLUMNS: Final = 20  #: Number of columns of the inverse that are computed at once.
+_COLUMNS: Final = 20  #: Number of columns of the inverse matrix that are computed at once.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Adjusted:
     """Result of an adjustment."""
 
-    #: Adjusted positions of each run, after the offset of the run has been subtracted; shape (n, 3).
+    #: Adjusted positions of each run without the offset of the run, shape (n, 3).
     ecef_m: tuple[Floats, ...]
-    #: Distances of the points of the line from the reference line, across and upward; shape (J, 2), or (0, 2) without
-    #: a line.
+    #: Shifts of the line's points from the reference line, across and upward, shape (J, 2); (0, 2) without a line.
     line_m: Floats
-    line_sigma_m: Floats  #: Standard deviations of `line_m`; shape (J, 2), or (0, 2) if not requested.
-    #: Mean weight of the positions or codes in each row of each run, shape (n,); about 1 without outliers, 0 without
-    #: an observation.
+    line_sigma_m: Floats  #: Standard deviations of `line_m`, shape (J, 2); (0, 2) if not requested.
+    #: Mean weight of the positions or codes in each row of each run, shape (n,). The weight is about 1 without
+    #: outliers, and 0 without an observation.
     weight: tuple[Floats, ...]
     scale: tuple[float, ...]  #: Ratio of actual to stated standard deviation of the positions or codes of each run.
 
@@ -73,11 +72,11 @@ def adjust(
     limits: SurveyLimits | None = None,
     sigmas: Literal["none", "line"] = "none",
 ) -> Adjusted:
-    """Adjust the positions of all runs, and the points of the line if `line` and `ties` are given.
+    """Adjust the positions of all runs and, if `line` and `ties` are given, the points of the line.
 
-    `near_ecef_m` are approximate positions of each run, shape (n, 3). `repeats` is the number of times that the run
-    passes the position of each row; the weight of the row is divided by this number. ``sigmas="line"`` computes
-    `line_sigma_m`.
+    `near_ecef_m` are approximate positions of each run, shape (n, 3). `repeats` states how often a run passes the
+    position of each row; the weight of the row is divided by this number. With ``sigmas="line"``, `line_sigma_m` is
+    computed.
     """
     limits = limits or SurveyLimits()
     origin = np.mean(near_ecef_m[0], axis=0)
@@ -117,8 +116,8 @@ def adjust(
 def independent_share(run: SurveyRun, near_m: Floats, limits: SurveyLimits) -> Floats:
     """Return the weight of each row as a fraction of an independent position, shape (n,).
 
-    The weight increases with the time and the distance since the previous row, up to 1 at twice the correlation time or
-    length.
+    The weight increases with the time and the distance since the previous row. It is 1 from twice the correlation time
+    or length on.
     """
     since = np.diff(run.seconds, prepend=run.seconds[0] - 2.0 * limits.correlation_s)
     way = np.concatenate([[0.0], np.linalg.norm(np.diff(near_m, axis=0), axis=1)])
@@ -130,7 +129,7 @@ def independent_share(run: SurveyRun, near_m: Floats, limits: SurveyLimits) -> F
 def _solve(
     systems: Sequence[Equations], unknowns: int, limits: SurveyLimits
 ) -> tuple[Floats, list[Floats], list[float]]:
-    """Solve by iterative reweighting; return the solution, and for each of `systems` the weights and the scale."""
+    """Solve by iterative reweighting; return the solution, and the weights and scale of each of the `systems`."""
     weights = [np.ones(len(system.share)) for system in systems]
     scales = [1.0 for _ in systems]
     solution = np.zeros(unknowns)
@@ -177,11 +176,11 @@ def _line_sigmas(
     unknowns: int,
     limits: SurveyLimits,
 ) -> Floats:
-    """Compute the standard deviations of the line, across and in height, shape (J, 2) [m].
+    """Compute the standard deviations of the line's points, across and in height, shape (J, 2) [m].
 
     The expected information of an observation with Student's t errors is ``(freedom + size) / (freedom + size + 2)``
-    times the information with normal errors. The information of each observation is multiplied by this factor or by its
-    robust weight, whichever is smaller.
+    times the information with normal errors. The information of an observation is multiplied by the smaller of this
+    factor and the robust weight.
     """
     expected = [
         np.full(len(weight), (limits.freedom + system.size) / (limits.freedom + system.size + 2.0))
@@ -211,13 +210,13 @@ def _of_rows(weight: Floats, run: SurveyRun) -> Floats:
     return np.asarray(np.bincount(rows, weights=weight, minlength=len(run)) / np.maximum(count, 1))
 
 
-_ROUNDS: Final = 3  #: Number of adjustments with the line; passes are searched before each of them.
-#: Distance between the passes of both directions beyond which the directions are treated as separate tracks, in
-#: standard deviations of a run's offset. The value is three standard deviations of the difference of two offsets.
+_ROUNDS: Final = 3  #: Number of adjustments with the line. The passes are searched before each adjustment.
+#: Distance between the passes of both directions beyond which they are treated as separate tracks, in standard
+#: deviations of a run's offset. The factor is three standard deviations of the difference of two offsets.
 _OTHER_TRACK: Final = 3.0 * 2.0**0.5
-_TURN_M: Final = 40.0  #: Distance over which a reversal is searched for [m].
+_TURN_M: Final = 40.0  #: Distance over which a reversal is searched [m].
 _END_POINTS: Final = 8  #: Number of points from which the direction at an end of the line is computed.
-_OF_THE_MAP: Final = 95.0  #: Percentile of the standard deviations along the line that is stated for the whole map.
+_OF_THE_MAP: Final = 95.0  #: The map's accuracy is this percentile of the standard deviations along the line.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -238,7 +237,7 @@ class Survey:
 def survey_line(runs: Sequence[SurveyRun], *, limits: SurveyLimits | None = None, name: str = "survey") -> Survey:
     """Adjust runs to the map of one line.
 
-    Each run is adjusted on its own first, then all runs are adjusted together as passes of the line. Raise ValueError
+    First, each run is adjusted on its own. Then all runs are adjusted together as passes of the line. Raise ValueError
     if no run moves, or the runs have no line in common.
     """
     limits = limits or SurveyLimits()
@@ -295,16 +294,17 @@ def survey_line(runs: Sequence[SurveyRun], *, limits: SurveyLimits | None = None
 
 
 def _unseen_sigma(runs: Sequence[SurveyRun]) -> Floats:
-    """Return additional standard deviations of the common error of a single run, plan and height, shape (2,) [m].
+    """Return additional standard deviations in plan and height for the common error of a single run, shape (2,) [m].
 
-    If there is no second run, the common error is not observable. The addition then doubles `SurveyRun.common_sigma_m`:
-    without this addition, the sigmas of single runs of low-cost receivers were half of the actual errors.
+    Without a second run, the common error is not observable. The addition doubles the effect of
+    `SurveyRun.common_sigma_m`. Without it, the sigmas of single runs with low-cost receivers were half of the actual
+    errors.
     """
     return np.sqrt(3.0) * np.array(runs[0].common_sigma_m) if len(runs) == 1 else np.zeros(2)
 
 
 def _interpolate_positions(run: SurveyRun) -> Floats:
-    """Return the positions of a run, with missing positions interpolated in time, shape (n, 3) [m]."""
+    """Interpolate missing positions of a run in time, and return all positions, shape (n, 3) [m]."""
     known = np.isfinite(run.ecef_m[:, 0])
     return np.stack([np.interp(run.seconds, run.seconds[known], run.ecef_m[known, i]) for i in range(3)], axis=1)
 
@@ -317,7 +317,7 @@ def _reference_line(course: Course, origin: Floats, axes: Floats) -> ReferenceLi
 
 
 def _repeats(runs: Sequence[SurveyRun], ties: Ties) -> list[Floats]:
-    """Return for each run the number of times that it passes the position of each row, shape (n,)."""
+    """Return how often each run passes the position of each of its rows, shape (n,)."""
     found = []
     for r, run in enumerate(runs):
         mine = ties.run == r
@@ -329,7 +329,7 @@ def _repeats(runs: Sequence[SurveyRun], ties: Ties) -> list[Floats]:
 
 
 def _without_loose_ends(plan_m: Floats) -> slice:
-    """Return the range of points of an open line, excluding end points that do not advance.
+    """Return the range of points of an open line without end points that do not advance.
 
     Such end points are noise at rest.
     """
@@ -347,7 +347,7 @@ def _without_loose_ends(plan_m: Floats) -> slice:
 
 
 def _points_ahead(plan_m: Floats) -> Indices:
-    """Return the indices of the points that advance by at least half a spacing; noise at rest causes other points."""
+    """Return the indices of points that advance by at least half a spacing; other points are noise at rest."""
     reach = _END_POINTS // 2
     index = np.arange(len(plan_m))
     way = plan_m[np.minimum(index + reach, len(index) - 1)] - plan_m[np.maximum(index - reach, 0)]
@@ -361,9 +361,9 @@ def _points_ahead(plan_m: Floats) -> Indices:
 
 
 def _points_of_line(course: Course, ties: Ties) -> tuple[Indices, Integers]:
-    """Return the indices of the line's points with at least one pass, and the number of passes at these points.
+    """Return the indices of the line's points that have passes, and the number of passes at these points.
 
-    The first point of a closed line is repeated at the end. Raise ValueError if fewer than three points are left.
+    The first point of a closed line is repeated at the end. Raise ValueError if fewer than three points remain.
     """
     count = np.bincount(ties.point, minlength=len(course))
     kept = np.flatnonzero(count > 0)
@@ -387,7 +387,7 @@ def _notes(
     beside: float,
     apart: float,
 ) -> tuple[str, ...]:
-    """Return the notes of the map on its runs, accuracy and gaps."""
+    """Return the map's notes on runs, accuracy and gaps."""
     against = sum(len(each.place) for each in passes if each.sign < 0) / max(sum(len(e.place) for e in passes), 1)
     driven = sum(float(leg.arc_m[-1]) for leg in legs)
     length = float(np.linalg.norm(np.diff(ecef_m, axis=0), axis=1).sum())

@@ -1,4 +1,4 @@
-"""Common line of several runs: its course without repetitions, and the positions of the runs' passes on it."""
+"""Common line of several runs: the course of the line without repetitions, and the passes of the runs over the line."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from railfix.core.arrays import Floats, Indices, Integers
 from railfix.track.survey.runs import SurveyLimits
 
 _SAME_WAY: Final = 0.7  #: Cosine of the largest angle between two passes of one line.
-#: Minimum distance along a leg between two parts that can be repetitions, in widths of the line (`same_line_m`).
+#: Minimum distance along a leg between two parts of which one repeats the other, in widths of the line (`same_line_m`).
 _APART_WIDTHS: Final = 3.0
-_MOSTLY: Final = 0.8  #: Fraction of the points of a stretch that must fulfil a condition.
-_SEAM_M: Final = 200.0  #: Distance over which the difference of two passes is distributed where they are joined [m].
-_GAP_S: Final = 10.0  #: Time without rows that is a gap [s].
-#: Longest gap within a leg [m]; the leg ends at a longer gap.
+_MOSTLY: Final = 0.8  #: Minimum fraction of the points of a stretch that must fulfil a condition.
+_SEAM_M: Final = 200.0  #: Distance over which the difference of two joined passes is distributed [m].
+_GAP_S: Final = 10.0  #: A longer time without rows is a gap [s].
+#: Longest gap within a leg [m]. At a longer gap, the leg ends.
 BRIDGED_M: Final = 500.0
-#: Cosine of the largest change of direction over a gap; the leg ends at a gap with a larger change.
+#: Cosine of the largest change of direction over a gap within a leg. At a larger change, the leg ends.
 _GOES_ON: Final = 0.9
 _NEIGHBOURS: Final = 24  #: Number of nearest vertices that are compared with a point.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Leg:
-    """Part of a run without a reversal, given by m selected rows at least a spacing apart."""
+    """Part of a run without a reversal: m selected rows that are at least a spacing apart."""
 
     run: int  #: Index of the run.
     row: Indices  #: Index of each selected row in the run, shape (m,).
-    arc_m: Floats  #: Distance from the first to each selected row, shape (m,).
+    arc_m: Floats  #: Distance from the first selected row to each selected row, shape (m,).
     point_m: Floats  #: East, north and up in the frame of the survey, shape (m, 3).
 
     def nodes_at(self, arc_m: Floats) -> tuple[Indices, Floats]:
-        """Return four rows around each arc length and their interpolation weights, shape (q, 4) each.
+        """Return the four rows around each of q arc lengths and their interpolation weights, shape (q, 4) each.
 
         The interpolation is cubic, and linear at the ends of the leg.
         """
@@ -68,7 +68,7 @@ class Course:
     """Line as a polyline of J points."""
 
     point_m: Floats  #: East, north and up of the points in the frame of the survey, shape (J, 3).
-    closed: bool = False  #: Whether the last point is joined to the first.
+    closed: bool = False  #: Whether the last point is joined to the first point.
 
     def __len__(self) -> int:
         return len(self.point_m)
@@ -81,17 +81,18 @@ class Course:
 
 @dataclass(frozen=True, kw_only=True)
 class Pass:
-    """Part of a leg that is on the line, given at p positions."""
+    """Part of a leg that is on the line, sampled at p positions."""
 
     leg: int  #: Index of the leg.
-    sign: int  #: 1 in the direction of the line, -1 against it.
+    sign: int  #: 1 in the direction of the line, -1 in the opposite direction.
     arc_m: Floats  #: Rising arc lengths along the leg, shape (p,).
-    #: Monotone fractional indices of points of the line; they go beyond the last point of a closed line; shape (p,).
+    #: Monotone fractional indices of points of the line, shape (p,). On a closed line, they continue beyond the last
+    #: point.
     place: Floats
 
 
 def directions(point_m: Floats, *, closed: bool = False) -> Floats:
-    """Compute horizontal unit vectors along a polyline at its points, from the neighbouring points, shape (J, 2)."""
+    """Compute the horizontal direction at each point of a polyline from the neighbouring points, shape (J, 2)."""
     plan = point_m[:, :2]
     step = np.roll(plan, -1, axis=0) - np.roll(plan, 1, axis=0) if closed else np.gradient(plan, axis=0)
     length = np.linalg.norm(step, axis=1, keepdims=True)
@@ -101,9 +102,9 @@ def directions(point_m: Floats, *, closed: bool = False) -> Floats:
 def find_legs(run: int, point_m: Floats, time_s: Floats, limits: SurveyLimits, turn_m: float) -> list[Leg]:
     """Divide a run into legs at reversals and at gaps over which the run is not straight.
 
-    Reversals are searched for over the distance `turn_m`.
+    Reversals are searched over the distance `turn_m`.
 
-    Rows nearer than the spacing to the previous selected row are left out.
+    Rows are left out if they are nearer to the previous selected row than the spacing.
     """
     spacing_m = limits.spacing_m
     rows = [0]
@@ -138,7 +139,7 @@ def find_legs(run: int, point_m: Floats, time_s: Floats, limits: SurveyLimits, t
 
 
 def _goes_on(plan_m: Floats, after: int, reach: int) -> bool:
-    """Return whether a run continues in its direction over the gap of at most `BRIDGED_M` before point `after`."""
+    """Return whether the gap before point `after` is at most `BRIDGED_M` long, and the run is straight over it."""
     if not 0 < after < len(plan_m) - 1:
         return False
     gap = plan_m[after] - plan_m[after - 1]
@@ -152,7 +153,7 @@ def _goes_on(plan_m: Floats, after: int, reach: int) -> bool:
 
 
 def _sample(leg: Leg, spacing_m: float) -> tuple[Floats, Floats]:
-    """Return arc lengths and positions of a leg at a constant spacing."""
+    """Sample a leg at a constant spacing, and return the arc lengths and positions."""
     arc = np.arange(0.0, leg.arc_m[-1], spacing_m)
     return arc, leg.at(arc)
 
@@ -160,7 +161,7 @@ def _sample(leg: Leg, spacing_m: float) -> tuple[Floats, Floats]:
 def find_course(legs: Sequence[Leg], limits: SurveyLimits) -> Course:
     """Find the course of the line.
 
-    The course is the longest leg up to where it repeats itself, extended at its ends by the remaining legs.
+    The course begins as the longest leg up to where this leg repeats itself. The remaining legs extend the course.
     """
     spacing_m, width_m = limits.spacing_m, limits.same_line_m
     order = sorted(range(len(legs)), key=lambda i: -float(legs[i].arc_m[-1]))
@@ -178,7 +179,7 @@ def find_course(legs: Sequence[Leg], limits: SurveyLimits) -> Course:
 
 
 def _until_repeated(points: Floats, spacing_m: float, width_m: float) -> Course:
-    """Return the course up to where a polyline runs parallel to an earlier part of itself for `_APART_WIDTHS`."""
+    """Return a polyline up to where it runs parallel to an earlier part of itself for `_APART_WIDTHS`."""
     least = int(_APART_WIDTHS * width_m / spacing_m)
     way = directions(points)
     tree = cKDTree(points[:, :2])
@@ -202,14 +203,14 @@ def _until_repeated(points: Floats, spacing_m: float, width_m: float) -> Course:
 
 
 def _close_course(points: Floats, end: int, start: int, spacing_m: float) -> Course:
-    """Return the closed course from point `start` to the same location at point `end`; distribute the misclosure."""
+    """Close the course from point `start` to point `end` at the same location, and distribute the misclosure."""
     turn = points[start : end + 1].copy()
     gap = turn[0] - turn[-1]
     along = directions(points)[start]
     gap[:2] -= along * float(along @ gap[:2])
     count = min(len(turn), int(_SEAM_M / spacing_m))
     turn[-count:] += gap * np.linspace(0.0, 1.0, count)[:, None]
-    # drop points at the end so that the last point is about one spacing before the first
+    # drop points at the end so that the last point is about one spacing before the first point
     ahead = (turn[:, :2] - turn[0, :2]) @ along
     near = np.linalg.norm(turn[:, :2] - turn[0, :2], axis=1) < 4.0 * spacing_m
     past = np.flatnonzero(near & (ahead > -0.5 * spacing_m) & (np.arange(len(turn)) > len(turn) // 2))
@@ -217,7 +218,7 @@ def _close_course(points: Floats, end: int, start: int, spacing_m: float) -> Cou
 
 
 def _extend(course: Course, points: Floats, spacing_m: float, width_m: float) -> Course | None:
-    """Return the course extended by the part of a leg beyond one of its ends; None if no part is beyond its ends."""
+    """Extend the course by the part of a leg beyond one of the course's ends; return None if there is no such part."""
     place, sign, _ = match_points(course, points, width_m)
     least = int(_APART_WIDTHS * width_m / spacing_m)
     near_end = 2.0 * width_m / spacing_m
@@ -255,10 +256,10 @@ def _extend(course: Course, points: Floats, spacing_m: float, width_m: float) ->
 
 
 def match_points(course: Course, points: Floats, width_m: float) -> tuple[Floats, Integers, Floats]:
-    """Match the points of a polyline to the course, shapes (q,).
+    """Match the q points of a polyline to the course.
 
     Return the fractional index of the course point (NaN off the course), the direction of travel (1 along the course,
-    -1 against it, 0 off the course), and the distance to the right of the course [m].
+    -1 opposite, 0 off the course), and the distance to the right of the course [m]. Each has shape (q,).
     """
     way, line_way = directions(points), course.direction
     vertices = course.point_m[:, :2]
@@ -286,7 +287,7 @@ def match_points(course: Course, points: Floats, width_m: float) -> tuple[Floats
 
 
 def find_passes(course: Course, legs: Sequence[Leg], limits: SurveyLimits) -> tuple[list[Pass], float]:
-    """Find the parts of all legs that are on the course, and the total length off the course [m]."""
+    """Find the parts of all legs that are on the course, and the total length of the other parts [m]."""
     spacing_m, width_m = limits.spacing_m, limits.same_line_m
     passes: list[Pass] = []
     beside = 0.0
@@ -330,8 +331,8 @@ def without_other_track(
 ) -> tuple[list[Pass], float]:
     """Remove the passes of one direction if both directions are on separate tracks.
 
-    Return the passes of the more frequent direction and the distance between the tracks [m], or all passes and 0 if the
-    median distance is at most `tolerance_m`.
+    Return the passes of the more frequent direction and the distance between the tracks [m]. If the tracks are at most
+    `tolerance_m` apart, return all passes and 0.
     """
     across: dict[int, Floats] = {}
     for sign in (1, -1):
@@ -354,17 +355,17 @@ def without_other_track(
 
 @dataclass(frozen=True, kw_only=True)
 class Ties:
-    """Assignment of m interpolated positions of runs to points of the line."""
+    """Assignments of m interpolated positions of runs to points of the line."""
 
     run: Indices  #: Index of the run, shape (m,).
-    row: Indices  #: Rows of the run between which the position is interpolated, shape (m, 4).
+    row: Indices  #: Rows of the run from which the position is interpolated, shape (m, 4).
     weight: Floats  #: Interpolation weights of the rows, with a sum of 1, shape (m, 4).
     point: Indices  #: Index of the point of the line, shape (m,).
     number: Indices  #: Index of the pass, shape (m,).
 
 
 def find_ties(course: Course, legs: Sequence[Leg], passes: Sequence[Pass]) -> Ties:
-    """Compute the interpolated position at which each pass goes by each point of the line."""
+    """Interpolate the position of each pass at each point of the line that it passes."""
     parts: list[tuple[Indices, Indices, Floats, Indices, Indices]] = []
     for number, each in enumerate(passes):
         place, arc = each.sign * each.place, each.arc_m

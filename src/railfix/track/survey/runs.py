@@ -1,4 +1,4 @@
-"""Runs of a survey: positions of one receiver, and the observations behind them."""
+"""Runs of a survey: positions of one receiver, and the observations from which they were computed."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ from railfix.core.timescale import seconds
 from railfix.io.position_log import PositionLog
 from railfix.track.map_from_positions import SIGMA_OF_QUALITY
 
-#: Standard deviations of the common error of all positions of a run, plan and height, by RTKLIB quality number [m]. The
-#: common error is due to orbits, ionosphere and reference frame, and is not reduced by averaging over the run.
+#: Standard deviations in plan and height of the error that is common to all positions of a run, by RTKLIB quality
+#: number [m]. The common error is due to orbits, ionosphere and reference frame. Averaging over the run does not reduce
+#: it.
 COMMON_SIGMA_OF_QUALITY: Final[Mapping[int, tuple[float, float]]] = MappingProxyType(
     {1: (0.02, 0.04), 2: (0.2, 0.4), 3: (0.5, 1.0), 4: (0.3, 0.6), 5: (1.0, 2.0)}
 )
 _UNKNOWN_QUALITY: Final = 5
-#: Standard deviation of the change of vertical velocity in one second [m/s]; road vehicles have 0.02 to 0.07.
+#: Standard deviation of the change of vertical velocity in one second [m/s]; 0.02 to 0.07 m/s for road vehicles.
 CLIMB_MPS2: Final = 0.05
 
 
@@ -34,8 +35,8 @@ class SurveyLimits(Settings):
     #: Correlation time of position errors.
     correlation_s: float = Field(default=30.0, ge=0)
     correlation_m: float = Field(default=50.0, ge=0)  #: Correlation length of position errors along the path.
-    #: Standard deviation of the change of horizontal velocity per axis in one second. Over five seconds, the duration
-    #: of curves and braking, the changes of three road vehicles were 1.2 to 1.8 m/s times the root of the time in s.
+    #: Standard deviation of the change of horizontal velocity per axis in one second. Three road vehicles had changes
+    #: of 1.2 to 1.8 m/s, times the square root of the time [s], over 5 s, the duration of curves and braking.
     acceleration_mps2: float = Field(default=1.5, gt=0)
     freedom: float = Field(default=3.0, gt=0)  #: Degrees of freedom of Student's t, which down-weights outliers.
     same_line_m: float = option(
@@ -60,7 +61,7 @@ class SurveyLimits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class RunSignals(FrozenArrays):
-    """Observations of a run: M pseudoranges, and C changes of ranges between successive rows."""
+    """Observations of a run: M pseudoranges, and C range changes between successive rows."""
 
     row: Indices  #: Row of the run, shape (M,).
     sat_ecef_m: Floats  #: Position of the satellite at transmission, shape (M, 3).
@@ -68,8 +69,8 @@ class RunSignals(FrozenArrays):
     sigma_m: Floats  #: Standard deviation of the pseudorange, shape (M,).
     clock: Indices  #: Index of the receiver clock, shape (M,).
     step: Indices  #: Row at which each change begins; the change ends at the next row; shape (C,).
-    before_ecef_m: Floats  #: Position of the satellite at transmission, for the row before the change, shape (C, 3).
-    after_ecef_m: Floats  #: Position of the satellite at transmission, for the row after the change, shape (C, 3).
+    before_ecef_m: Floats  #: Satellite position at transmission, for the row at which the change begins, shape (C, 3).
+    after_ecef_m: Floats  #: Satellite position at transmission, for the row at which the change ends, shape (C, 3).
     change_m: Floats  #: Change of the range, from carrier phases or Dopplers, shape (C,).
     change_sigma_m: Floats  #: Standard deviation of the change, shape (C,).
     by_doppler: Masks  #: Whether the change was computed from Dopplers, shape (C,).
@@ -83,10 +84,9 @@ class SurveyRun(FrozenArrays):
     time: Datetimes  #: Times of the rows, strictly rising, shape (n,).
     ecef_m: Floats  #: Positions, shape (n, 3); NaN without a position.
     sigma_m: Floats  #: Standard deviations east, north and up, shape (n, 3).
-    #: Observations from which the positions were computed; if given, the observations are adjusted instead of the
-    #: positions.
+    #: Observations from which the positions were computed. If given, they are adjusted instead of the positions.
     signals: RunSignals | None = None
-    #: Standard deviations of the common error of all positions, in plan and height.
+    #: Standard deviations in plan and height of the error that is common to all positions.
     common_sigma_m: tuple[float, float] = COMMON_SIGMA_OF_QUALITY[_UNKNOWN_QUALITY]
 
     def __post_init__(self) -> None:
@@ -110,8 +110,8 @@ class SurveyRun(FrozenArrays):
 def run_of_log(log: PositionLog, limits: SurveyLimits) -> SurveyRun:
     """Convert a position log to a run of a survey.
 
-    The positions are sorted and thinned to `limits.interval_s`; their sigmas are at least a third of
-    `SIGMA_OF_QUALITY`. Raise ValueError if fewer than three positions are left.
+    The positions are sorted and thinned to `limits.interval_s`. Their sigmas are at least a third of
+    `SIGMA_OF_QUALITY`. Raise ValueError if fewer than three positions remain.
     """
     rows = np.flatnonzero(np.isfinite(log.ecef_m).all(axis=1) & ~np.isnat(log.time))
     rows = rows[np.argsort(log.time[rows], kind="stable")]
