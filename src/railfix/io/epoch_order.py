@@ -17,8 +17,8 @@ from railfix.gnss.observations import Observations
 
 DUPLICATES: Final = "duplicate epochs"
 OUT_OF_ORDER: Final = "epochs out of order"
-#: Largest number of epochs with later tags that may precede an epoch in the file, or with earlier tags that may follow
-#: it. Above this number, the time tag of the epoch is taken as wrong.
+#: The time tag of an epoch is taken as wrong if more than this number of the epochs before it in the file have later
+#: tags, or more than this number of the epochs after it have earlier tags.
 MOST_PASSED: Final = 20
 _HELD: Final = 2 * MOST_PASSED  #: Number of epochs held back until later epochs are read.
 #: A time tag that is earlier or later than both neighbours by more than this is taken as wrong.
@@ -26,17 +26,17 @@ _LONE: Final = np.timedelta64(3600, "s")
 _ARRAYS: Final = ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_lock")
 
 
-#: Consecutive epochs of a file in file order: the path of the file, the epochs, and the line number of each epoch,
-#: shape (T,), 0 in binary files.
+#: Consecutive epochs of a file: the path of the file, the epochs in file order, and the line number of each epoch,
+#: shape (T,). Line numbers are 0 for binary files.
 FileEpochs: TypeAlias = tuple[str, Observations, Integers]
 
 
 class EpochOrder:
-    """Sorter of the epochs of one log; the result does not depend on the division of the log into parts."""
+    """Sorter of the epochs of one log. The sorted epochs are the same however the log is divided into parts."""
 
     def __init__(self, broken_lines: BrokenLines) -> None:
         self._broken_lines = broken_lines
-        self._times: list[Datetimes] = []  # of all epochs returned so far
+        self._times: list[Datetimes] = []  # times of all epochs returned so far
         self._counts = {DUPLICATES: 0, "sorted": 0}
         self._first: dict[str, tuple[str, int]] = {}
         self._found: list[str] = []
@@ -44,7 +44,7 @@ class EpochOrder:
         self._break = False
 
     def ordered(self, runs: Iterable[FileEpochs]) -> Iterator[Observations]:
-        """Yield the epochs in order of time; the last part yielded has no epochs, only notes and counts.
+        """Yield the epochs in parts, in order of time. The last part has only the notes and counts of the log.
 
         Raise InputFileError if a time tag is wrong and `broken_lines` is "stop".
         """
@@ -82,8 +82,8 @@ class EpochOrder:
     def _sort(self, runs: Sequence[FileEpochs], *, final: bool) -> tuple[Observations, list[FileEpochs]]:
         """Sort and check the waiting epochs.
 
-        Return the epochs that no epoch later in the file can precede, and a list of the other epochs, each as a part of
-        its own.
+        Return the epochs that are ready, since no epoch later in the file can precede them, and a list of the epochs
+        that must wait, one element per epoch.
         """
         paths, epochs, lines = zip(*runs, strict=True)
         joined, line = stack_parts(list(epochs)), np.concatenate(lines)
@@ -204,7 +204,7 @@ def _is_repeated(time: Datetimes) -> Masks:
 
 
 def _is_lone(time: Datetimes) -> Masks:
-    """Return whether each time tag is over `_LONE` later or earlier than both neighbours, if these are in order."""
+    """Return whether each time tag is over `_LONE` before or after both neighbours, if the neighbours are in order."""
     lone = np.zeros(len(time), dtype=np.bool_)
     before, this, after = time[:-2], time[1:-1], time[2:]
     lone[1:-1] = (before < after) & ((this > after + _LONE) | (this < before - _LONE))
@@ -212,7 +212,7 @@ def _is_lone(time: Datetimes) -> Masks:
 
 
 def _merge(joined: Observations, order: Indices, repeated: Masks) -> Observations:
-    """Return epochs in a given order; repeated epochs fill the absent values of the first epoch with the same tag."""
+    """Return the epochs `order`. Repeated epochs only fill absent values of the first epoch with the same time tag."""
     ordered = take_epochs(joined, order)
     if not repeated.any():
         return ordered

@@ -63,7 +63,7 @@ _ROOTS: Final[dict[str, FileKind]] = {
     "kml": "kml", "gpx": "gpx", "osm": "osm", "rdf": "rdf", "featurecollection": "gml",
 }  # fmt: skip
 _RINEX: Final[dict[str, FileKind]] = {"O": "observations", "B": "sbas", "M": "rinex", "C": "rinex"}
-#: Kind by the ending of the file name, used where the content is ambiguous.
+#: Kind by the ending of the file name, used where the content fits no kind.
 _ENDINGS: Final[dict[str, FileKind]] = {
     ".csv": "table", ".pos": "rtklib", ".nmea": "nmea", ".gpx": "gpx", ".kml": "kml", ".osm": "osm", ".pbf": "pbf",
     ".geojson": "geojson", ".json": "geojson", ".xml": "xml", ".landxml": "xml", ".railml": "xml", ".ifc": "ifc",
@@ -73,7 +73,7 @@ _ENDINGS: Final[dict[str, FileKind]] = {
 
 
 def find_kind(path: FilePath) -> FileKind:
-    """Return the kind of a file, detected from its first decompressed bytes or else from the ending of its name.
+    """Return the kind of a file, detected from its first decompressed bytes or, failing that, from its name ending.
 
     TOML files are recognised by name, and EGNSS MATE tables by name or header. The kind is "unknown" if neither the
     bytes nor the name fit a kind.
@@ -122,7 +122,7 @@ def has_times(path: FilePath) -> bool:
 
 
 def _header_line(head: bytes) -> str:
-    """Return the first line that is neither blank nor a comment; "" if there is none."""
+    """Return the first line that is neither blank nor a comment, or "" if all lines are."""
     coding = "utf-16" if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
     lines = head.decode(coding, "replace").splitlines()
     return next((line for line in lines if line.strip() and not line.startswith("#")), "")

@@ -78,14 +78,14 @@ def observations_from_xarray(data: xr.Dataset) -> Observations:
     Parameters
     ----------
     data : xarray.Dataset
-        As returned by ``georinex.load``, preferably with ``useindicators=True``; without indicators, no loss of lock
-        is reported.
+        Dataset returned by ``georinex.load``, preferably with ``useindicators=True``. Without indicators, the
+        observations have no loss-of-lock flags.
 
     Returns
     -------
     Observations
-        Channels with at least one observation, sorted by satellite, then signal. RINEX 2 types are mapped to signals
-        as in `read_observations`. Times are GPS time, which georinex truncates to 1 us.
+        Channels with at least one observation, sorted by satellite, then signal. RINEX 2 types are mapped to signals as
+        in `read_observations`. Times are GPS time, truncated to 1 us by georinex.
 
     Raises
     ------

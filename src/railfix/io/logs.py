@@ -50,29 +50,29 @@ def read_observations(
     Parameters
     ----------
     path : path or sequence of path
-        RINEX observation files, logs in UBX, SBF or RTCM 3 (messages of other protocols are skipped), or EGNSS MATE
-        tables S_GNSS_SAT; plain or compressed. Several files must be of one kind, and are read in order of time.
+        RINEX observation files, receiver logs (UBX, SBF, RTCM 3; other messages are skipped) or EGNSS MATE tables
+        S_GNSS_SAT, plain or compressed. Several files must be of one kind, and are read in order of time.
     broken_lines : {"stop", "count"}
         With "stop", a malformed RINEX line raises InputFileError. With "count", the values or epochs that the line
         affects are skipped and counted. Malformed messages in a receiver log are always skipped and counted.
     systems : iterable of str, optional
         Letters of the constellations to read, all by default.
     start, end : datetime64 or str, optional
-        Time span to read, GPS time; the end is excluded.
+        Time span to read, GPS time; epochs at `end` or later are excluded.
     date : datetime64 or str, optional
-        Any time within half a week of the log; needed for RTCM 3 logs without ephemerides, because their observations
-        have no week number.
+        Any time within half a week of the log. It is required for RTCM 3 logs without ephemerides, because RTCM 3
+        observations have no week number.
     reader : {"railfix", "georinex"}
-        "georinex" reads RINEX files with georinex, an independent reader, for comparison. georinex is slower, ignores
-        events, scale factors and the indicators of bands other than 1 and 2, and does not count malformed lines.
+        "georinex" reads RINEX files with georinex, an independent reader, for comparison. georinex is slower, and does
+        not count malformed lines. It ignores events, scale factors, and the indicators of bands other than 1 and 2.
 
     Raises
     ------
     InputFileError
         A file cannot be read, or has no observations that can be dated.
     MismatchError
-        No epoch lies between `start` and `end`; files are of different kinds; or a receiver log is to be read with
-        georinex.
+        No epoch lies between `start` and `end`, the files are of different kinds, or `reader` is "georinex" and a file
+        is a receiver log.
     """
     pieces = scan_observations(
         path, broken_lines=broken_lines, systems=systems, start=start, end=end, date=date, epochs=1 << 62, reader=reader
@@ -182,7 +182,7 @@ def _receiver_runs(
     limits: tuple[np.datetime64 | None, np.datetime64 | None, np.datetime64 | None],
     progress: Callable[[float], None] | None,
 ) -> Iterator[Observations]:
-    """Yield the blocks of all receiver logs in order of time, cut to the requested constellations and times."""
+    """Yield the observations of all receiver logs in blocks, in order of time, for the requested systems and times."""
     from railfix.io.receiver.log import scan_receiver_log
 
     start, end, date = limits
@@ -236,10 +236,10 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop", date: T
     ----------
     paths : path or sequence of path
     broken_lines : {"stop", "count"}
-        With "stop", a malformed record raises InputFileError. With "count", it is counted in `Navigation.skipped` and
-        described in `Navigation.notes`.
+        With "stop", a malformed record raises InputFileError. With "count", a malformed record is skipped, counted in
+        `Navigation.skipped` and described in `Navigation.notes`.
     date : datetime64 or str, optional
-        Any time within half a week of the logs; needed for RTCM 3 logs whose records have no full date.
+        Any time within half a week of the logs. It is required for RTCM 3 logs whose records have no full date.
 
     Raises
     ------
@@ -265,7 +265,7 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop", date: T
 
 
 def _join(parts: list[Navigation]) -> Navigation:
-    """Join the records of several sources; the first Klobuchar coefficients and leap seconds found are used."""
+    """Join the navigation data of several files. The first Klobuchar coefficients and first leap seconds are used."""
     return Navigation(
         kepler=join_rows([part.kepler for part in parts]),
         glonass=join_rows([part.glonass for part in parts]),

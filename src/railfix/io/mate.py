@@ -80,7 +80,7 @@ def mate_table(path: FilePath) -> str:
 
 
 def read_mate(path: FilePath, needed: tuple[str, ...], table_name: str = "") -> pl.DataFrame:
-    """Read a table from CSV (also .gz) or Parquet; column names become upper case, and missing columns are null.
+    """Read a table (.csv, .csv.gz, .parquet). Column names become upper case; absent columns are added as null.
 
     Without `table_name`, the file name determines the table. Raise InputFileError if the file cannot be read, has an
     unknown column or no rows, or lacks a `needed` column.
@@ -115,7 +115,7 @@ def only_device(path: FilePath, table: pl.DataFrame) -> pl.DataFrame:
     return table
 
 
-#: RINEX code by constellation and by signal name of Septentrio receivers (SBF reference guide, signal types).
+#: RINEX code by constellation and Septentrio signal name (SBF reference guide, signal types).
 _CODES: Final[Mapping[str, Mapping[str, str]]] = {
     "G": {"L1CA": "1C", "L1P": "1W", "L1PY": "1W", "L2P": "2W", "L2PY": "2W", "L2C": "2L", "L5": "5Q", "L1C": "1L"},
     "R": {"L1CA": "1C", "G1CA": "1C", "L1P": "1P", "L2CA": "2C", "G2CA": "2C", "L2P": "2P", "L3": "3Q"},
@@ -144,7 +144,7 @@ def signal_code(satellite: str | None, signal: str) -> str:
 
 
 def read_mate_observations(path: str) -> Observations:
-    """Read the observations of the antenna and device that have the most rows in a table S_GNSS_SAT.
+    """Read the observations in a table S_GNSS_SAT; of several antennas or devices, only the one with the most rows.
 
     Raise InputFileError if the file is not such a table, or no row has a known satellite and signal.
     """
@@ -185,7 +185,7 @@ def _one_antenna(path: str, table: pl.DataFrame) -> tuple[pl.DataFrame, tuple[st
 def _as_arrays(
     table: pl.DataFrame, time_ns: np.ndarray, problems: tuple[str, ...], skipped: Counter[str]
 ) -> Observations:
-    """Arrange the rows as epochs by channels; of several rows of one signal at one epoch, the last is used."""
+    """Arrange the rows in arrays of epochs by channels. The last of several rows for one signal and epoch is used."""
     times, row = np.unique(time_ns, return_inverse=True)
     names = table["SAT_ID"] + table["code"]
     channels, column = np.unique(names.to_numpy().astype(np.str_), return_inverse=True)

@@ -14,10 +14,10 @@ from railfix.core.arrays import Floats, Indices, Integers, Strings
 from railfix.core.errors import InputFileError
 from railfix.core.files import FilePath, read_text
 
-_BLOCK: Final = 4096  #: Number of rows converted together to columns.
+_BLOCK: Final = 4096  #: Number of rows that are converted to columns at a time.
 _SEPARATORS: Final = (";", "\t", "|")  #: Column separators other than the comma.
-#: Column names that other programs often use in tables of positions and maps, by railfix's name. Only lower-case
-#: letters and digits of a name are compared. A height without a unit is in metres.
+#: Column names that other programs often use in tables of positions and maps, by railfix's name of the column. Names
+#: are compared without regard to case and punctuation. A height without a unit is in metres.
 _USUAL: Final[dict[str, tuple[str, ...]]] = {
     "latitude_deg": ("lat", "latitude", "latdeg", "latitudedegrees", "gpslatitude"),
     "longitude_deg": ("lon", "long", "lng", "longitude", "londeg", "longitudedegrees", "gpslongitude"),
@@ -26,7 +26,7 @@ _USUAL: Final[dict[str, tuple[str, ...]]] = {
         "elevation", "ellipsoidalheight", "ellipsoidalheightm", "hae",
     ),
 }  # fmt: skip
-#: Unit by ending of a column name, for units other than railfix's.
+#: Unit that the ending of a column name denotes, for units that railfix does not use.
 _OTHER_UNITS: Final = {
     "ft": "feet", "feet": "feet", "foot": "feet", "usft": "feet", "mm": "millimetres", "cm": "centimetres",
     "km": "kilometres", "rad": "radians", "gon": "gon", "yd": "yards",
@@ -106,15 +106,15 @@ def fails(parse: Callable[[Any], object], text: object) -> bool:
 
 
 def is_named(theirs: str, name: str) -> bool:
-    """Return whether a column name of a file is railfix's `name`, or a usual name of it in the same unit."""
+    """Return whether the column name `theirs` is railfix's `name`, or a usual name for the same quantity and unit."""
     plain = "".join(c for c in theirs.lower() if c.isalnum())
     return plain in _USUAL.get(name, ()) or theirs.lower() == name
 
 
 def with_usual_names(table: NamedColumns, names: Iterable[str]) -> NamedColumns:
-    """Return the table after renaming columns that have usual names ("Latitude", "lon", "alt") to railfix's `names`.
+    """Return the table with usual column names ("Latitude", "lon", "alt") replaced by railfix's `names`.
 
-    Raise InputFileError if such a column is in another unit ("height_ft").
+    Raise InputFileError if a column name denotes another unit ("height_ft").
     """
     cells, usual = dict(table.cells), {}
     for name in names:

@@ -20,14 +20,14 @@ from railfix.core.timescale import SECONDS_PER_DAY, timedelta, utc_to_gpst
 from railfix.gnss.joined_observations import first_problems
 from railfix.io.position_log import PositionLog
 
-#: Names of the counts of lines that are not errors.
+#: Names under which lines that are not errors are counted.
 _OTHER_LINES, _UNCHECKED = (
     "lines skipped that are not NMEA 0183 sentences",
     "sentences without checksum",
 )
-#: A geoid separation of 0 is reported as doubtful where the geoid is farther than this from the ellipsoid [m].
+#: A geoid separation of 0 is reported as doubtful if the geoid is at least this far from the ellipsoid [m].
 _GEOID_M: Final = 2.0
-#: RTKLIB's quality (`position_log.PositionLog`) by GGA's quality (NMEA 0183 4.10, field 6); other qualities become 0.
+#: RTKLIB quality (`position_log.PositionLog`) by GGA quality indicator (NMEA 0183 4.10, field 6); 0 if not listed.
 QUALITY: Final = {1: 5, 2: 4, 3: 5, 4: 1, 5: 2, 9: 3}
 
 
@@ -37,7 +37,7 @@ class _Gga:
 
     line: int
     of_day_s: float  #: UTC time of day, NaN where blank.
-    quality: int  #: RTKLIB's quality (`QUALITY`).
+    quality: int  #: RTKLIB quality (`QUALITY`).
     geodetic: tuple[float, float, float]  #: Latitude, longitude [deg], ellipsoidal height [m]; NaN where unknown.
     separation_m: float  #: Height of the geoid above the ellipsoid, NaN where blank.
 
@@ -57,19 +57,19 @@ def read_nmea(path: FilePath, *, broken_lines: BrokenLines = "stop", date: np.da
     Parameters
     ----------
     path : path
-        Text file, plain or compressed. Other NMEA sentences, AIS sentences and other lines are skipped; text before the
-        ``$`` of a sentence is ignored. A sentence may lack its checksum.
+        Text file, plain or compressed. Only GGA, RMC and ZDA sentences are used; text before the ``$`` of a sentence is
+        ignored. A sentence may lack its checksum.
     broken_lines : {"stop", "count"}
         With "stop", a sentence with a wrong checksum or invalid fields raises InputFileError. With "count", the
         sentence is skipped and noted. A malformed last line is always skipped and noted.
     date : datetime64, optional
-        UTC date of the first GGA, for logs without RMC and ZDA. If `date` is given, the dates in the log are ignored.
+        UTC date of the first GGA sentence, for logs without RMC and ZDA. It overrides the dates in the log.
 
     Returns
     -------
     PositionLog
-        Times are in GPS time, and quality is numbered as by RTKLIB (`QUALITY`). A position without height or geoid
-        separation is NaN in `ecef_m`, and has latitude and longitude in `plan_deg`.
+        Times are in GPS time. Qualities are RTKLIB numbers (`QUALITY`). A position without height or geoid separation
+        is NaN in `ecef_m`; its latitude and longitude are in `plan_deg`.
 
     Raises
     ------
@@ -144,7 +144,7 @@ def _doubt_separation(path: FilePath, fixes: list[_Gga], geodetic: Floats) -> li
 def _sentences(
     path: FilePath, lines: list[str], problems: list[InputFileError], counts: Counter[str]
 ) -> Iterator[tuple[int, list[str]]]:
-    """Yield the line number and the fields of every sentence whose checksum is correct or absent; append errors to
+    """Yield the line number and fields of every sentence that has no checksum or a correct one; append errors to
     `problems`.
     """
     for number, line in enumerate(lines, start=1):
@@ -210,8 +210,8 @@ _DATED: Final[dict[str, Callable[[int, list[str]], _Date | None]]] = {"RMC": _rm
 
 
 def _times(fixes: list[_Gga], dates: list[_Date], *, chained: bool) -> Datetimes:
-    """Compute the GPS time of each fix from the preceding date sentence, or, if `chained`, by counting days from the
-    first date.
+    """Compute the GPS time of each fix. The date is that of the preceding date sentence, or, if `chained`, the first
+    date plus one day for each midnight passed.
     """
     of_day = np.array([fix.of_day_s for fix in fixes])
     line = np.array([fix.line for fix in fixes])

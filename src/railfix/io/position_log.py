@@ -28,7 +28,7 @@ CSV_COLUMNS: Final = (
 )  # fmt: skip
 #: Further columns of a position table, available in `PositionLog.table`.
 OTHER_COLUMNS: Final = ("antenna", "chainage_m", "speed_mps", "sigma_m", "source", "environment")
-#: Largest accepted Unix time [s], at the end of 2099; larger values are probably milliseconds.
+#: Largest accepted Unix time [s], near the end of 2099; larger values are probably in milliseconds.
 _LAST_UNIX_S: Final = 4.1e9
 _GEODETIC: Final = ("latitude_deg", "longitude_deg", "height_m")
 _CARTESIAN: Final = ("x_m", "y_m", "z_m")
@@ -36,26 +36,26 @@ _CARTESIAN: Final = ("x_m", "y_m", "z_m")
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class PositionLog(NotebookTable):
-    """Positions of a log, n rows in the order of the file or sorted by time (`railfix.io.positions.read_positions`)."""
+    """Positions of a log, n rows, in file order unless `railfix.io.positions.read_positions` sorted them by time."""
 
     path: str
-    time: Datetimes  #: GPS time; NaT where the log has none; shape (n,).
-    ecef_m: Floats  #: NaN where a row has no position or no height, shape (n, 3).
-    #: Quality as numbered by RTKLIB (manual 2.4.2, B.1): 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP. A CSV log
-    #: may have other numbers. -1 where the log has no quality; shape (n,).
+    time: Datetimes  #: GPS time, NaT where the log has no time; shape (n,).
+    ecef_m: Floats  #: ECEF position, NaN where a row has no position or no height; shape (n, 3).
+    #: RTKLIB quality number (manual 2.4.2, B.1): 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP; shape (n,). The
+    #: number is -1 where the log has no quality. A CSV log may have other numbers.
     quality: Integers
-    sigma_m: Floats  #: Standard deviations north, east, up; NaN where the log has none; shape (n, 3).
+    sigma_m: Floats  #: Standard deviations north, east, up, NaN where absent; shape (n, 3).
     line: Integers  #: Line number of each row in the file, shape (n,).
     notes: tuple[str, ...] = ()
-    ratio: Floats | None = None  #: Ratio of the ambiguity test, where the log has it; shape (n,).
-    #: Latitude and longitude of all rows if any row has no height, otherwise None; shape (n, 2).
+    ratio: Floats | None = None  #: Ratio of the ambiguity test, shape (n,); None if the log has no such column.
+    #: Latitude and longitude of all rows, shape (n, 2); None if all rows with a position have a height.
     plan_deg: Floats | None = None
-    antennas: tuple[str, ...] = ()  #: Names in the column ``antenna``; empty where the log has no such column.
+    antennas: tuple[str, ...] = ()  #: Names in the column ``antenna``, empty without this column.
     table: NamedColumns | None = None  #: All columns of a CSV or RTKLIB log, None for other logs.
 
     @property
     def geodetic(self) -> tuple[Floats, Floats, Floats]:
-        """Latitude, longitude [deg] and ellipsoidal height [m], shape (n,) each; NaN where the log has none."""
+        """Latitude, longitude [deg] and ellipsoidal height [m], shape (n,) each; NaN where absent."""
         latitude, longitude, height = geodetic_from_ecef(self.ecef_m)
         if self.plan_deg is None:
             return latitude, longitude, height
@@ -70,7 +70,7 @@ class PositionLog(NotebookTable):
         return bool((self.quality >= 0).any())
 
 
-#: Number of malformed lines beyond which a file is not accepted as a log.
+#: Largest number of malformed lines in a log; a file with more is not accepted.
 _MOST_BROKEN: Final = 200
 Parsed = TypeVar("Parsed")
 
@@ -80,9 +80,9 @@ def skip_broken(
 ) -> tuple[Parsed, tuple[str, ...]]:
     """Parse the lines of a log; return the result, and a note on each skipped line.
 
-    With "count", malformed lines below the header are skipped. With "stop", only an incomplete last line is skipped,
-    which a power cut may leave. Raise InputFileError if any other line is malformed, or if there are more than
-    `_MOST_BROKEN` malformed lines.
+    With "count", malformed lines below the first line of data are skipped. With "stop", only an incomplete last line is
+    skipped, because a power cut may leave one. Raise InputFileError if any other line is malformed, or if there are
+    more than `_MOST_BROKEN` malformed lines.
     """
     text = read_text(path)
     lines = text.splitlines()
@@ -110,9 +110,9 @@ def parse_csv_positions(lines: list[str], path: FilePath, columns: Mapping[str, 
 
 
 def positions_of_table(table: NamedColumns) -> PositionLog:
-    """Return the positions in a table; the columns of heights, sigmas, times and quality may be absent.
+    """Return the positions in a table. It may lack the columns of heights, standard deviations, times and quality.
 
-    Raise InputFileError if the table has no position columns or no rows, or a value is not a number or out of range.
+    Raise InputFileError if the table has no position columns or no rows, or if a value is no number or out of range.
     """
     path = table.path
     cartesian = all(name in table for name in _CARTESIAN)
@@ -156,7 +156,7 @@ def positions_of_table(table: NamedColumns) -> PositionLog:
 
 
 def numbers_or_nan(table: NamedColumns, name: str) -> Floats:
-    """Parse a column as numbers; NaN in blank cells, and in all rows if the table has no such column."""
+    """Parse a column as numbers. Blank cells are NaN; all rows are NaN if the table has no such column."""
     return table.numbers(name, blank=np.nan) if name in table else np.full(len(table), np.nan)
 
 
@@ -167,7 +167,7 @@ def qualities_in_words(log: PositionLog) -> str:
 
 
 def column_names(pairs: Iterable[str]) -> dict[str, str]:
-    """Return the file's column names by railfix's names, parsed from strings ``NAME=COLUMN``.
+    """Parse strings ``NAME=COLUMN``; return a mapping from railfix's column names to the column names of the file.
 
     Raise SettingsError for a string of another form.
     """
@@ -181,9 +181,9 @@ def column_names(pairs: Iterable[str]) -> dict[str, str]:
 
 
 def rename_columns(table: NamedColumns, columns: Mapping[str, str], *, known: Collection[str]) -> NamedColumns:
-    """Return the table with copies of some columns under railfix's names; `columns` is as in `read_positions`.
+    """Return the table with the columns in `columns` copied under railfix's names (`columns` as in `read_positions`).
 
-    Raise SettingsError if a name is not in `known`, and InputFileError if the table has no such column.
+    Raise SettingsError if railfix's name of a column is not in `known`, and InputFileError if the table lacks a column.
     """
     if unknown := sorted(set(columns) - set(known)):
         raise SettingsError(f"{table.path}: column {unknown[0]!r} is unknown; expected one of {', '.join(known)}")
@@ -227,7 +227,7 @@ def positions_times(table: NamedColumns) -> Datetimes:
 
 
 def _column_of_times(table: NamedColumns, name: str) -> Datetimes:
-    """Parse a column of ISO 8601 times; dates may have slashes, and UTC may end in Z or +00:00."""
+    """Parse a column of ISO 8601 times. Dates may have slashes; times in UTC may end in Z or +00:00."""
     cells = [cell.replace("/", "-") for cell in table.cells[name].to_list()]
     if table.separator != ",":
         cells = [cell.replace(",", ".") for cell in cells]
@@ -267,9 +267,7 @@ _OF_RTKLIB: Final = {
 
 
 def parse_rtklib_positions(lines: list[str], path: FilePath) -> PositionLog:
-    """Parse RTKLIB's solution format (manual 2.4.2, B.1); raise InputFileError if the file has baselines, or heights
-    above the geoid instead of the ellipsoid.
-    """
+    """Parse RTKLIB's solution format (manual 2.4.2, B.1); raise InputFileError for baselines or geoid heights."""
     scale, names = _rtklib_header(path, [line for line in lines if line.startswith("%")])
     rows = [(i, line) for i, line in enumerate(lines, start=1) if line.strip() and not line.startswith("%")]
     if not rows:

@@ -22,12 +22,12 @@ from railfix.io.position_log import PositionLog, parse_csv_positions, parse_rtkl
 from railfix.io.receiver.log import read_receiver_positions
 from railfix.io.xml_lines import read_gpx_lines
 
-#: RTKLIB's quality by word that occurs in NovAtel's position type.
+#: RTKLIB quality by a word in the NovAtel position type.
 _QUALITY: Final = {"INT": 1, "FLOAT": 2, "WAAS": 3, "SBAS": 3, "PSRDIFF": 4, "PPP": 6, "SINGLE": 5, "PSRSP": 5}
 
 
 def _read_gpx(path: FilePath) -> PositionLog:
-    """Read the points of tracks and routes in GPX 1.0 or 1.1, whose times are in UTC.
+    """Read the points of tracks and routes in GPX 1.0 or 1.1; GPX times are in UTC.
 
     Heights without ``geoidheight`` are used as ellipsoidal heights, with a note.
     """
@@ -60,7 +60,7 @@ def _read_gpx(path: FilePath) -> PositionLog:
 
 
 def _parse_novatel(text: list[str], path: FilePath) -> PositionLog:
-    """Parse the BESTPOSA, BESTGNSSPOSA and INSPVAA (INSPVASA, INSPVAXA) logs of a NovAtel receiver (SPAN).
+    """Parse the BESTPOSA, BESTGNSSPOSA, INSPVAA, INSPVASA and INSPVAXA logs of a NovAtel receiver (SPAN).
 
     BESTPOSA and BESTGNSSPOSA logs whose status is not SOL_COMPUTED are left out.
     """
@@ -100,8 +100,8 @@ def _parse_novatel(text: list[str], path: FilePath) -> PositionLog:
     )
 
 
-#: Rows are sorted by time if all rows have times and no row is out of order by more than this [s]. Otherwise the rows
-#: stay in the order of the file.
+#: Rows are sorted by time if all rows have times and no time goes back by more than this [s]. Otherwise the rows stay
+#: in the order of the file.
 _SORTED_S: Final = 60.0
 
 
@@ -125,10 +125,10 @@ def read_positions(
         With "stop", a malformed line raises InputFileError; with "count", it is skipped and noted. An incomplete last
         line is always skipped.
     date : datetime64, optional
-        UTC date of the first position in an NMEA log without dates (see `railfix.io.nmea.read_nmea`). For a UBX log
-        whose positions have no date, any time within half a week of the log.
+        For an NMEA log without dates, the UTC date of the first position (see `railfix.io.nmea.read_nmea`). For a UBX
+        log whose positions have no date, any time within half a week of the log.
     columns : mapping of str, optional
-        Column names in the file by railfix's names, for tables with other names: ``{"latitude_deg": "Lat"}``.
+        Column names of the file by railfix's column names, such as ``{"latitude_deg": "Lat"}``.
     heights : {"needed", "optional"}
         With "needed", a file without any height raises InputFileError.
     antennas : {"one", "several"}
@@ -181,7 +181,7 @@ def read_positions(
 
 
 def _in_order(log: PositionLog) -> PositionLog:
-    """Sort the log by time if its rows are only slightly late; add a note if times go back."""
+    """Sort the log by time if no time goes back by more than `_SORTED_S`; add a note if any time goes back."""
     known = np.flatnonzero(~np.isnat(log.time))
     time = log.time[known]
     back = np.flatnonzero(np.diff(time) < np.timedelta64(0, "ns")) + 1

@@ -1,8 +1,8 @@
 """Write positions of a run as KML, GPX, GeoJSON, GeoPackage or GeoParquet, with a style for QGIS.
 
 KML and GPX are written from templates, because pyogrio writes no styles to KML and no description to GPX. GeoParquet is
-written by polars, because the pyogrio wheels lack its driver. Files are built in memory, because GDAL does not always
-report a full disk.
+written by polars, because the pyogrio wheels lack the GeoParquet driver. Files are built in memory, because GDAL does
+not always report a full disk.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from railfix.core.extras import needs_extra
 from railfix.core.staged_files import stage_file
 from railfix.core.utc import gpst_to_utc
 
-#: Columns written as attributes of each position, where the table has them.
+#: Columns written as attributes of each position, if the table has them.
 ATTRIBUTES: Final = (
     "time_gpst", "antenna", "status", "chainage_m", "kilometrage_m", "along_sigma_m", "protection_level_m",
     "protection_level_ground_m", "protection_status", "speed_mps", "track", "track_chainage_m", "track_probability",
@@ -56,9 +56,9 @@ _STYLED: Final = (".geojson", ".gpkg", ".parquet")
 
 
 def style_file(path: Path) -> Path | None:
-    """Return the path of the QGIS style to write for a file.
+    """Return the path of the QGIS style to write for a file, or None if no style must be written.
 
-    Return None if the format has no style, or the style file exists with the same content.
+    No style is written if the format has none, or if the style file already exists with the same content.
     """
     style = path.with_suffix(".qml")
     if path.suffix.lower() not in _STYLED or (style.is_file() and style.read_bytes() == _style()):
@@ -67,7 +67,7 @@ def style_file(path: Path) -> Path | None:
 
 
 def write_positions(rows: pl.DataFrame, path: Path, *, description: str) -> int:
-    """Write the rows with coordinates and the QGIS style; return the number of rows written.
+    """Write the rows that have coordinates, and the QGIS style. Return the number of rows written.
 
     The ending of the file name determines the format. Raise NoPositionError if no row has coordinates.
     """
@@ -112,7 +112,7 @@ def _content(points: pl.DataFrame, path: Path, description: str) -> bytes:
 
 
 def _features(points: pl.DataFrame, driver: str, *, layer: str, **options: str) -> bytes:
-    """Return the content of a file written by GDAL."""
+    """Return the file content for a format that is written by GDAL."""
     with needs_extra():
         import pyogrio
 
@@ -121,7 +121,7 @@ def _features(points: pl.DataFrame, driver: str, *, layer: str, **options: str) 
     file = BytesIO()
     pyogrio.raw.write(
         file,
-        _wkb(points, "extended"),  # the only flavor that pyogrio up to 0.10 accepts
+        _wkb(points, "extended"),  # pyogrio up to 0.10 accepts no other flavor
         [value if value.dtype.kind in "fM" else value.astype(object) for value in values],
         np.array([column.name for column in fields]),
         field_mask=[column.is_null().to_numpy() for column in fields],

@@ -25,12 +25,12 @@ from railfix.io.position_log import PositionLog, numbers_or_nan, qualities_in_wo
 from railfix.io.positions import read_positions
 from railfix.io.sensor_tables import get_column, get_times, read_sensor_table
 
-#: Columns of the file, in this order.
+#: Columns of a reference file, in this order.
 COLUMNS: Final = (
     "time_gpst", "antenna", "chainage_m", "x_m", "y_m", "z_m", "speed_mps", "sigma_m", "source", "environment",
 )  # fmt: skip
-SOURCES: Final = ("rtk", "bridged", "truth", "")  #: Source of a reference position; blank where the file has none.
-#: A CSV file with these columns and without a source column is taken as ground truth from the simulator.
+SOURCES: Final = ("rtk", "bridged", "truth", "")  #: Sources of a reference position; blank if unknown.
+#: A CSV file that has these columns, but no column ``source``, is taken as ground truth from the simulator.
 _OF_TRUTH: Final = ("antenna", "chainage_m", "kilometrage_m", "speed_mps")
 _FIX: Final = 1  #: RTKLIB's quality of a fixed solution.
 
@@ -41,11 +41,11 @@ class AntennaReference(NotebookTable):
 
     time: Datetimes  #: GPS time, strictly rising, shape (R,).
     ecef_m: Floats  #: Position in ECEF, shape (R, 3).
-    chainage_m: Floats  #: Chainage, NaN where the file has none; shape (R,).
-    speed_mps: Floats  #: Speed along the line, positive toward rising chainage; NaN where unknown; shape (R,).
-    sigma_m: Floats  #: Standard deviation along the track; NaN where the file has none; shape (R,).
+    chainage_m: Floats  #: Chainage, NaN where absent; shape (R,).
+    speed_mps: Floats  #: Speed along the line, positive toward rising chainage, NaN where absent; shape (R,).
+    sigma_m: Floats  #: Standard deviation along the track, NaN where absent; shape (R,).
     source: Strings  #: Source of the position, one of `SOURCES`; shape (R,).
-    environment: Strings  #: Environment such as "open", blank where the file has none, shape (R,).
+    environment: Strings  #: Environment such as "open", blank where absent; shape (R,).
 
     def __post_init__(self) -> None:
         epochs = len(self.time)
@@ -83,21 +83,21 @@ def read_reference(
     quality : collection of int
         Accepted values of `PositionLog.quality`; ignored for a log without quality numbers.
     columns : mapping of str, optional
-        For CSV with other column names, as in `read_positions`.
+        Column names of a CSV file, as in `read_positions`.
     broken_lines, date
         As in `read_positions`.
 
     Returns
     -------
     dict of str to AntennaReference
-        Rows without position or time are dropped; of rows with the same time, the first is used. ``source`` is taken
-        from the file; without this column, it is "truth" for files of the simulator and "rtk" for other files.
+        Rows without position or time are dropped, and only the first of several rows with the same time is used. If the
+        file has no column ``source``, the source is "truth" for simulator files and "rtk" for others.
 
     Raises
     ------
     InputFileError
-        An antenna has fewer than two accepted positions with a time, a source is unknown, or several antennas are to be
-        read from a file without the column ``antenna``.
+        An antenna has fewer than two accepted positions with a time; a source is unknown; or `antennas` names several
+        antennas, but the file has no column ``antenna``.
     NoPositionError
         No row has a position.
     """
@@ -123,9 +123,7 @@ def read_reference(
 
 
 def _columns(log: PositionLog, table: NamedColumns) -> dict[str, NDArray[np.generic]]:
-    """Return the columns of all rows, NaN or blank where the file lacks them; raise InputFileError for an unknown
-    source.
-    """
+    """Return the columns of all rows; absent values are NaN or blank. Raise InputFileError for an unknown source."""
     source = table.texts("source", absent="truth" if all(name in table for name in _OF_TRUTH) else "rtk")
     unknown = ~np.isin(source, SOURCES)
     if unknown.any():
@@ -158,8 +156,8 @@ def _of_antenna(
 
 
 def reference_table(references: Mapping[str, AntennaReference]) -> pl.DataFrame:
-    """Return reference positions as a table with the columns of a reference file, sorted by time; unknown values are
-    null.
+    """Return a table of the reference positions, sorted by time, with the columns of a reference file; absent values
+    are null.
     """
     tables = [
         pl.DataFrame(
@@ -182,7 +180,7 @@ def reference_table(references: Mapping[str, AntennaReference]) -> pl.DataFrame:
     )
 
 
-#: Longest interval between rows [s]; a longer interval counts as a gap, in which values are unknown.
+#: Longest interval between rows [s]. A longer interval is a gap, in which values are unknown.
 LONGEST_STEP_S = 1.0
 
 
@@ -192,14 +190,14 @@ class Pulses:
 
     path: str
     time: Datetimes
-    #: Count of pulses, or distance [m] for the kind "distance"; shape (P,). If `signed`, the count falls where the
+    #: Count of pulses, or distance [m] if `kind` is "distance"; shape (P,). If `signed`, the count falls where the
     #: train runs backward.
     count: Floats
     kind: str  #: Source of the count: "count" (readings of a counter), "pulse" (single pulses) or "distance".
-    signed: bool  #: Whether the table states the running direction, by a column or by a falling count.
+    signed: bool  #: Whether a column ``direction`` or a falling count states the running direction.
 
     def at(self, time: Datetimes) -> Floats:
-        """Interpolate the count linearly; NaN outside the table and in gaps in which the count changes.
+        """Interpolate the count linearly. Return NaN outside the table, and in gaps across which the count changes.
 
         Single pulses (`kind` "pulse") have no gaps.
         """
@@ -214,7 +212,7 @@ class Pulses:
 
 @dataclass(frozen=True, kw_only=True)
 class Acceleration:
-    """Longitudinal acceleration toward the vehicle's front, A rows [m/s2].
+    """Longitudinal acceleration [m/s2], positive toward the vehicle's front, A rows.
 
     `kind` is "motion", or "specific_force" if the values include gravity on gradients.
     """
@@ -225,7 +223,7 @@ class Acceleration:
     kind: str
 
     def mean_over(self, time: Datetimes) -> Floats:
-        """Compute mean accelerations between consecutive times, shape (len(time) - 1,); NaN outside the table or over
+        """Compute mean accelerations between consecutive times, shape (len(time) - 1,); NaN outside the table or across
         gaps.
         """
         known, at = seconds(self.time - self.time[0]), seconds(time - self.time[0])
@@ -243,9 +241,9 @@ class Acceleration:
 def read_pulses(path: FilePath) -> Pulses:
     """Read a tachometer table (CSV or Parquet) with ``time_gpst`` and a count.
 
-    The count is in the column ``count`` (reading of a counter, which falls when the train runs backward and never
-    wraps), ``pulse`` (number of a pulse, as for `railfix run`) or ``distance_m`` (distance run). Without these columns,
-    each row is one pulse. A column ``direction`` of 1 and -1 gives the sign. Raise InputFileError if the file is not
+    The count is in the column ``count`` (counter reading, which must not wrap and may fall when the train runs
+    backward), ``pulse`` (pulse number, as for `railfix run`) or ``distance_m`` (distance run). Without these columns,
+    each row is one pulse. A column ``direction`` (1 or -1) states the sign. Raise InputFileError if the file is not
     such a table, the times do not rise, or a direction is neither 1 nor -1.
     """
     table = read_sensor_table(path, "pulses")
@@ -266,9 +264,9 @@ def read_pulses(path: FilePath) -> Pulses:
 def read_acceleration(path: FilePath) -> Acceleration:
     """Read a table (CSV or Parquet) of accelerations toward the front, with ``time_gpst`` and one column of values.
 
-    ``specific_force_mps2``, and ``force_forward_mps2`` in tables of the simulator, are measured by an accelerometer and
-    include gravity on gradients, which is removed with the map; ``acceleration_mps2`` is the train's acceleration
-    without gravity. Raise InputFileError if the table has none or several of these columns, or the times do not rise.
+    ``specific_force_mps2`` (``force_forward_mps2`` in simulator tables) is measured by an accelerometer. It includes
+    gravity on gradients, which is removed with the map. ``acceleration_mps2`` is the train's acceleration without
+    gravity. Raise InputFileError if the table has none or several of these columns, or the times do not rise.
     """
     table = read_sensor_table(path, "acceleration")
     kinds = {

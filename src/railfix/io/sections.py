@@ -1,4 +1,4 @@
-"""Reader of the sections of a line with their environment."""
+"""Reader of the environment (open, tunnel) along a line, by sections."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ SECTION_COLUMNS: Final = ("from_m", "to_m", "environment")  #: Columns of a tabl
 
 @dataclass(frozen=True, kw_only=True)
 class Sections:
-    """Environment of S stretches of the line, which are in ascending order and do not overlap."""
+    """Environment of S sections of a line. The sections are in ascending order and do not overlap."""
 
     path: Path
     from_m: Floats  #: Chainage of the start, shape (S,) [m].
-    to_m: Floats  #: Chainage of the end, shape (S,) [m]; the end is part of the last stretch only.
+    to_m: Floats  #: Chainage of the end, shape (S,) [m]. Only the last section includes its end.
     environment: tuple[str, ...]
 
     def at(self, chainage_m: Floats) -> Strings:
-        """Return the environment at chainages, shape (T,); blank outside every section and for NaN."""
+        """Return the environment at chainages, shape (T,), blank outside all sections and for NaN chainages."""
         names = np.array([*self.environment, ""])
         index = np.searchsorted(self.from_m, chainage_m, side="right") - 1
         safe = np.maximum(index, 0)
@@ -37,7 +37,7 @@ class Sections:
 def read_sections(path: Path) -> Sections:
     """Read the sections of a line from a CSV file with the columns ``from_m,to_m,environment``.
 
-    Raise InputFileError if a column is missing, or a section has no length, no environment, or overlaps another.
+    Raise InputFileError if a column is missing, or if a section has no length or environment or overlaps another.
     """
     table = read_named_columns(path)
     for name in SECTION_COLUMNS:

@@ -17,7 +17,7 @@ from railfix.core.tables import reading_table
 from railfix.core.timescale import utc_to_gpst
 from railfix.io.mate import mate_table, only_device, read_mate
 
-#: Columns of each table besides ``time_gpst``, as `railfix simulate` writes them; columns in brackets may be absent.
+#: Columns of each kind of table, without ``time_gpst``. Columns in brackets may be absent.
 COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
     "tachometer": ("pulse", "[direction]"),
     "inertial": (
@@ -32,20 +32,20 @@ COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
     "pulses": ("[count]", "[pulse]", "[distance_m]", "[direction]"),
     "acceleration": ("[specific_force_mps2]", "[force_forward_mps2]", "[acceleration_mps2]"),
 }  # fmt: skip
-#: Sensors whose tables may have rows with a time alone; such a row means that the sensor had no output.
+#: Kinds of tables that may have rows with only a time, which mean that the sensor had no output.
 _SILENT: Final = ("tachometer", "ranging", "balises")
-_TIMELESS: Final = ("ranging_units", "list of balises")  #: Tables without times.
-#: Tables without empty values, with strictly rising times and at least two rows.
+_TIMELESS: Final = ("ranging_units", "list of balises")  #: Kinds of tables without times.
+#: Kinds of tables that must have no empty values, strictly rising times and at least two rows.
 _COMPLETE: Final = ("pulses", "acceleration")
 _NAMES: Final = ("unit", "balise", "track")  #: Text columns.
 _WHOLE: Final = ("pulse", "direction")  #: Integer columns.
 
 
 def read_sensor_table(path: FilePath, kind: str) -> pl.DataFrame:
-    """Read a sensor table of a kind in `COLUMNS`, with names as text and with GPS times in ascending order.
+    """Read a sensor table of a kind in `COLUMNS`. Times are in GPS time.
 
-    Rows with only a time are dropped. Raise InputFileError if the file is not such a table or has no rows, or if a
-    value is missing or wrong; the message names the row.
+    Rows with only a time are dropped from the tables of `tachometer`, `ranging` and `balises`. Raise InputFileError if
+    the file is not such a table or has no rows, if times fall, or if a value is missing or wrong.
     """
     with reading_table(path, f"cannot be read as a table of the {kind} ({{}})"):
         if mate_table(path):
@@ -74,7 +74,7 @@ def read_sensor_table(path: FilePath, kind: str) -> pl.DataFrame:
     )
     if stamp:
         _check_times(path, table["time_gpst"], kind)
-    if silent is not None:  # a recorded stream has rows with the time alone (`railfix.live.stream`)
+    if silent is not None:  # a recorded stream has rows with only a time (`railfix.live.stream`)
         table = table.filter(~silent)
         if not len(table):
             raise InputFileError(path, f"has times but no values of the {kind}; leave the file out")
@@ -84,11 +84,11 @@ def read_sensor_table(path: FilePath, kind: str) -> pl.DataFrame:
 
 
 def find_sensor_table(names: Collection[str]) -> str | None:
-    """Return the kind in `COLUMNS` of a table with columns of the given names; None if there is no such kind."""
+    """Return the kind in `COLUMNS` of a table that has columns with the given names, or None if no kind fits."""
     present = set(names)
     for kind, columns in COLUMNS.items():
         needed = {name for name in columns if not name.startswith("[")}
-        if not needed:  # a table of optional columns needs one of them
+        if not needed:  # where all columns are optional, one must be present
             needed = (present & set(names_of_columns(kind)) - {"direction"}) or {""}
         if needed <= present and ("time_gpst" in present) == (kind not in _TIMELESS):
             return kind
@@ -96,7 +96,7 @@ def find_sensor_table(names: Collection[str]) -> str | None:
 
 
 def names_of_columns(kind: str) -> list[str]:
-    """Return the column names of a kind of table except the time, including columns that may be absent."""
+    """Return all column names of a kind of table, optional columns included, the time excluded."""
     return [column.strip("[]") for column in COLUMNS[kind]]
 
 
@@ -106,7 +106,7 @@ def get_times(table: pl.DataFrame) -> Datetimes:
 
 
 def get_column(table: pl.DataFrame, name: str) -> NDArray[Any]:
-    """Return a column of a table; empty cells are 0 in integer columns and NaN otherwise; an absent column is NaN."""
+    """Return a column of a table, NaN if absent. Empty cells are 0 in integer columns and NaN in other columns."""
     if name not in table.columns:
         return np.full(len(table), np.nan)
     if name in _NAMES:
@@ -129,7 +129,7 @@ def _check_times(path: FilePath, column: pl.Series, kind: str) -> None:
 
 
 def _numbers(path: FilePath, column: pl.Series, kind: str, silent: pl.Series | None) -> pl.Series:
-    """Return a column as numbers; raise InputFileError if a value is not a number, or is missing and required."""
+    """Return a column as numbers. Raise InputFileError if a value is no number, or if a required value is missing."""
     numbers = column.cast(pl.Int64 if column.name in _WHOLE else pl.Float64, strict=False)
     wrong = numbers.is_null() & column.is_not_null()
     if kind in _COMPLETE or column.name == "chainage_m":
@@ -143,7 +143,7 @@ def _numbers(path: FilePath, column: pl.Series, kind: str, silent: pl.Series | N
     return numbers
 
 
-#: railfix's column names by EGNSS MATE column names, for each table.
+#: Mapping from EGNSS MATE column names to railfix's column names, for each table.
 _MATE_COLUMNS: Final[dict[str, dict[str, str]]] = {
     "S_IMU": {
         "SPEC_FORCE_X": "force_forward_mps2", "SPEC_FORCE_Y": "force_right_mps2", "SPEC_FORCE_Z": "force_down_mps2",
@@ -154,9 +154,9 @@ _MATE_COLUMNS: Final[dict[str, dict[str, str]]] = {
 
 
 def _read_mate_table(path: FilePath, kind: str) -> pl.DataFrame:
-    """Read an EGNSS MATE table as a table with `COLUMNS`.
+    """Read an EGNSS MATE table; return a table with the columns in `COLUMNS`.
 
-    Raise InputFileError if the table is of another kind, has several devices, or has forces that exclude gravity.
+    Raise InputFileError if the table is of another kind, has several devices, or has forces without gravity.
     """
     name = mate_table(path)
     expected = {"inertial": "S_IMU", "radar": "S_SPEEDOMETER", "balises": "S_BALISEREADER"}
@@ -183,9 +183,7 @@ def _read_mate_table(path: FilePath, kind: str) -> pl.DataFrame:
 
 
 def _first_of_group(table: pl.DataFrame) -> pl.DataFrame:
-    """Return the rows of the first balise of each group (N_PIG = 0), whose position is used as the position of the
-    group.
-    """
+    """Return the rows of the first balise of each group (N_PIG = 0). Its position is used as the group's position."""
     return table.filter(pl.col("N_PIG").cast(pl.Int64).fill_null(0) == 0)
 
 

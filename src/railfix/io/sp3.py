@@ -15,15 +15,15 @@ from railfix.gnss.orbits.ephemerides import POINTS
 from railfix.gnss.plausible_records import plausible_radius
 from railfix.io.file_kind import wrong_kind
 
-#: Time systems that agree with GPS time to nanoseconds; SP3-a files name no time system, and their times are GPS time.
+#: Time systems that agree with GPS time to nanoseconds. SP3-a files name no time system; they are in GPS time.
 _GPST: Final = ("GPS", "GAL", "QZS", "CCC", "")
-#: Functions that convert other time systems to GPS time, by the names of the systems in files.
+#: Functions that convert other time systems to GPS time, by the name of the time system in files.
 _TO_GPST: Final = {"UTC": utc_to_gpst, "GLO": utc_to_gpst, "BDT": bdt_to_gpst, "BDS": bdt_to_gpst}
-_NO_CLOCK: Final = 999_999.0  #: Value of an unknown clock in a file [us]; some programs write 0.
+_NO_CLOCK: Final = 999_999.0  #: Clock value that means unknown [us]; some programs write 0 instead.
 
 
 def read_sp3(paths: Paths) -> PreciseEphemeris:
-    """Read satellite positions and clocks from one or several SP3 files, joined in order of time.
+    """Read satellite positions and clocks from one or several SP3 files.
 
     Parameters
     ----------
@@ -33,8 +33,8 @@ def read_sp3(paths: Paths) -> PreciseEphemeris:
     Returns
     -------
     PreciseEphemeris
-        Where files overlap, the file given first takes precedence. Positions that are zero or at an implausible radius
-        for the constellation, and clocks that are zero or unknown, are NaN.
+        Where files overlap, the file given first takes precedence. Positions are NaN where zero or at an implausible
+        radius for the constellation. Clocks are NaN where zero or unknown.
 
     Raises
     ------
@@ -74,7 +74,7 @@ def read_sp3(paths: Paths) -> PreciseEphemeris:
 
 
 def _states(path: FilePath) -> list[tuple[int, str, list[float]]]:
-    """Read epoch [ns of GPS time since 1970], satellite, and x, y, z [km] and clock [us] of each position line."""
+    """Read epoch [ns of GPS time since 1970], satellite, x, y, z [km] and clock [us] from each position line."""
     lines = read_text_lines(path)
     if not lines or lines[0][:2] not in ("#a", "#b", "#c", "#d"):
         raise wrong_kind(path, "a file of precise orbits, SP3 (its first line begins with #a, #b, #c or #d)")
@@ -98,7 +98,7 @@ def _states(path: FilePath) -> list[tuple[int, str, list[float]]]:
 
 
 def _satellite(text: str) -> str:
-    """Return the satellite as ``G01``; SP3-a omits the letter of GPS and may have blanks for zeros.
+    """Return the satellite name, such as ``G01``. SP3-a omits the GPS letter, and may have blanks instead of zeros.
 
     Raise ValueError if the text has no number.
     """
@@ -110,7 +110,7 @@ def _satellite(text: str) -> str:
 
 
 def _numbers(line: str) -> list[float]:
-    """Parse position [km] and clock [us], the clock NaN where blank; raise ValueError if a value is infinite."""
+    """Parse position [km] and clock [us]; a blank clock is NaN. Raise ValueError if a value is infinite."""
     x, y, z = (float(line[4 + 14 * i : 18 + 14 * i]) for i in range(3))
     text = line[46:60].strip()
     clock = float(text) if text else np.nan
@@ -120,7 +120,7 @@ def _numbers(line: str) -> list[float]:
 
 
 def _time_system(path: FilePath, lines: list[str]) -> str:
-    """Return the time system of the first %c line, "GPS" without such a line; raise InputFileError if unsupported."""
+    """Return the time system in the first %c line, or "GPS". Raise InputFileError if the time system is unsupported."""
     for number, line in enumerate(lines, start=1):
         if line.startswith("%c"):
             system = line[9:12].strip().upper()

@@ -1,8 +1,8 @@
 """Position message of a train, for live positions, supervision and control.
 
-A message is encoded in CBOR with integer keys (RFC 8949, canonical order) in about 100 bytes; receivers skip unknown
-keys. A message can also be written as JSON, and as an ETCS position report (SUBSET-026 v4, 7.4.2, packet 0). CBOR needs
-``railfix[live]``.
+A message is encoded in about 100 bytes of CBOR with integer keys (RFC 8949, canonical order). Receivers skip unknown
+keys. A message can also be written as JSON, or as an ETCS position report (SUBSET-026 v4, 7.4.2, packet 0). CBOR
+requires ``railfix[live]``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from railfix.core.extras import needs_extra
 from railfix.core.messages import Message
 from railfix.core.settings import Model
 
-VERSION: Final = 1  #: Version of the schema; a receiver rejects other versions.
+VERSION: Final = 1  #: Version of the message schema; messages of other versions are rejected.
 LONGEST: Final = 1024  #: Longest encoded message [bytes]; longer input is rejected without decoding.
 
 Unsigned = Annotated[int, Field(ge=0, lt=1 << 63)]
@@ -32,10 +32,10 @@ class MessageStatus(IntEnum):
 
     POSITION = 0  #: Position that passed every check.
     COASTING = 1  #: Position from sensors alone.
-    DOUBTFUL = 2  #: Position with a failed check, or several possible tracks or positions.
-    NO_POSITION = 3  #: Observations received, but no position computed.
-    NO_INPUT = 4  #: No input received in this period.
-    #: Satellite positioning is suspended by order of the ground side; railfix itself sends no such message.
+    DOUBTFUL = 2  #: Position with a failed check, or with several possible tracks or positions.
+    NO_POSITION = 3  #: Observations were received, but no position was computed.
+    NO_INPUT = 4  #: No input was received in this period.
+    #: Satellite positioning is suspended by order of the trackside. railfix itself sends no such message.
     SUSPENDED = 5
 
 
@@ -66,21 +66,21 @@ class SuspectedInterference(IntEnum):
 class Unknown(IntFlag):
     """Unknown properties of the train."""
 
-    FACING = 1  #: Direction of the front end; `over_cm` and `under_cm` are bounds in both directions.
-    FRONT_END = 2  #: Position of the front end; `chainage_cm` refers to the reference point of the train.
+    FACING = 1  #: Direction of the front end; `over_cm` and `under_cm` then hold in both directions.
+    FRONT_END = 2  #: Position of the front end; `chainage_cm` is then that of the train's reference point.
     LENGTH = 4  #: Train length.
 
 
 class TrainMessage(Message):
     """Position message of a train."""
 
-    train: Unsigned  #: Identity of the train.
-    sequence: Unsigned  #: Number of the message, counted by the sender.
-    time_ns: Unsigned  #: Time of validity of the position, GPS time since 1980-01-06.
-    sent_ns: Unsigned  #: Time of sending by the sender's clock, GPS time since 1980-01-06.
+    train: Unsigned  #: Train identity.
+    sequence: Unsigned  #: Message number, counted by the sender.
+    time_ns: Unsigned  #: Time at which the position is valid, GPS time since 1980-01-06.
+    sent_ns: Unsigned  #: Time of sending, measured by the sender's clock, GPS time since 1980-01-06.
     line: Unsigned  #: Identity of the line or track.
     chainage_cm: Signed | None = None  #: Chainage of the train's front end; None without a position.
-    #: The front end is at most `under_cm` ahead of and `over_cm` behind `chainage_cm` (SUBSET-026 3.6.4).
+    #: The front end is at most `under_cm` ahead of `chainage_cm`, and at most `over_cm` behind (SUBSET-026 3.6.4).
     over_cm: Unsigned | None = None
     under_cm: Unsigned | None = None
     speed_cmps: Signed | None = None  #: Speed, positive toward rising chainage; None where unknown.
@@ -97,19 +97,18 @@ class TrainMessage(Message):
     length_cm: Unsigned = 0  #: Train length.
     complete: bool = False  #: Whether the train's integrity is confirmed.
     sigma_cm: Unsigned | None = None  #: Standard deviation of the position along the line, rounded up.
-    #: Number of the newest movement authority that the train has accepted; the message thereby acknowledges the
-    #: authority.
+    #: Number of the newest movement authority that the train has accepted. The message acknowledges this authority.
     authority: Unsigned | None = None
     authority_end_cm: Signed | None = None  #: End of the train's movement authority, rounded away from the train.
-    interference: SuspectedInterference | None = None  #: Suspected interference; None from trains without this check.
-    #: Safe front end and safe rear end: no part of the train is ahead of the safe front end or behind the safe rear
-    #: end, in the direction of `facing`. None without bounds, or where the end or the direction is unknown.
+    interference: SuspectedInterference | None = None  #: Suspected interference; None if the train does not check it.
+    #: Safe front end and safe rear end: in the direction of `facing`, no part of the train is ahead of the safe front
+    #: end or behind the safe rear end. None without bounds, or where the front end or its direction is unknown.
     safe_front_cm: Signed | None = None
     safe_rear_cm: Signed | None = None
-    unknown: Unknown = Unknown(0)  #: Properties of the train unknown to the sender.
-    #: Random number drawn at each start of the on-board unit, at which `sequence` restarts.
+    unknown: Unknown = Unknown(0)  #: Train properties that the sender does not know.
+    #: Random number drawn at each start of the on-board unit; `sequence` restarts at the same time.
     session: Annotated[int, Field(ge=0, lt=1 << 62)] | None = None
-    brake_order: Unsigned | None = None  #: Number of the brake order that the train executes, None without an order.
+    brake_order: Unsigned | None = None  #: Number of the brake order being executed, None without an order.
 
     @model_validator(mode="after")
     def _place_with_bounds(self) -> Self:
@@ -121,7 +120,7 @@ class TrainMessage(Message):
         return self
 
 
-#: Integer key of each field; keys are never reused with another meaning.
+#: CBOR key of each field. A key never gets another meaning in later versions.
 KEYS: Final[dict[str, int]] = {name: k for k, name in enumerate(TrainMessage.model_fields, start=1)}
 _NAMES: Final = {key: name for name, key in KEYS.items()}
 _VERSION_KEY: Final = 0
@@ -144,7 +143,7 @@ def cbor() -> ModuleType:
 
 
 def encode(message: TrainMessage) -> bytes:
-    """Encode a message in CBOR; equal messages give equal bytes, and fields that are None are left out."""
+    """Encode a message in CBOR. Equal messages give equal bytes. Fields that are None are omitted."""
     # keys rise in the order of the fields, which is the canonical order
     values = {KEYS[name]: value for name, value in vars(message).items() if value is not None}
     data: bytes = cbor().dumps({_VERSION_KEY: VERSION, **values})
@@ -152,7 +151,7 @@ def encode(message: TrainMessage) -> bytes:
 
 
 def decode(data: bytes) -> TrainMessage:
-    """Decode CBOR, skipping unknown keys; raise MessageError if the bytes are not a valid message of this version."""
+    """Decode CBOR; unknown keys are skipped. Raise MessageError if this is no valid message of this version."""
     cbor2 = cbor()
     if len(data) > LONGEST:
         raise MessageError(f"has {len(data)} bytes, at most {LONGEST} were expected")
@@ -176,7 +175,7 @@ def decode(data: bytes) -> TrainMessage:
 
 
 def _entries(data: bytes) -> int:
-    """Return the number of entries in the head of a CBOR map (RFC 8949, 3.1); -1 for an indefinite length."""
+    """Return the number of entries that a CBOR map declares (RFC 8949, 3.1), -1 for a map of indefinite length."""
     size = data[0] & 0x1F
     return size if size < 24 else int.from_bytes(data[1 : 1 + (1 << (size - 24))], "big") if size < 28 else -1
 
@@ -192,7 +191,7 @@ def validate_message(kind: type[Model], values: dict[str, Any]) -> Model:
 
 
 def to_json(message: TrainMessage) -> str:
-    """Return a message as one line of JSON with the field names as keys; statuses and sources are written as names."""
+    """Return a message as one line of JSON. Keys are the field names; statuses and sources are written as names."""
     values = message.model_dump()
     values["status"] = message.status.name.lower()
     values["sources"] = [source.name.lower() for source in Source if source in message.sources and source.name]
@@ -203,7 +202,7 @@ def to_json(message: TrainMessage) -> str:
 
 
 def from_json(line: str) -> TrainMessage:
-    """Parse a message from its line of JSON; raise MessageError if the text is not a valid message of this version."""
+    """Parse a message written by `to_json`. Raise MessageError if the text is not a valid message of this version."""
     try:
         values = json.loads(line)
     except (ValueError, RecursionError):
@@ -227,14 +226,14 @@ def from_json(line: str) -> TrainMessage:
     return validate_message(TrainMessage, values)
 
 
-_LARGEST_LENGTH: Final = 32_766  #: Largest value of a length in packet 0; the next value means unknown.
+_LARGEST_LENGTH: Final = 32_766  #: Largest length value in packet 0; the next larger value means unknown.
 
 
 def etcs_report(message: TrainMessage, *, reference_cm: int, reference: int) -> dict[str, int]:
     """Return the fields of packet 0 (SUBSET-026 v4, 7.4.2.1), with the position relative to a balise group.
 
-    `reference_cm` is the chainage of the group, and `reference` its identity (NID_LRBG). Raise ValueError if the
-    message has no position of the front end, or the front end is too far from the group.
+    `reference_cm` is the chainage of the balise group, and `reference` its identity (NID_LRBG). Raise ValueError if the
+    message has no position of the front end, or if the front end is too far from the group.
     """
     if message.chainage_cm is None or message.over_cm is None or message.under_cm is None:
         raise ValueError("a message without a position has no packet 0")
@@ -242,8 +241,8 @@ def etcs_report(message: TrainMessage, *, reference_cm: int, reference: int) -> 
         raise ValueError("a message without the position of the front end has no packet 0")
     distance = message.chainage_cm - reference_cm
     metres = {"D_LRBG": abs(distance), "L_DOUBTOVER": message.over_cm, "L_DOUBTUNDER": message.under_cm}
-    # Lengths are in metres (Q_SCALE 1), or in tens of metres (Q_SCALE 2) if they are too large. Confidence bounds are
-    # rounded up, and include the rounding of the distance, so that they remain bounds.
+    # Lengths are in metres (Q_SCALE 1), or in tens of metres (Q_SCALE 2) if too large for metres. The rounding error of
+    # the distance is added to the confidence bounds, which are then rounded up, so that they remain valid.
     largest = max(metres.values())
     scale, unit = (1, 100) if largest <= 100 * _LARGEST_LENGTH - 200 else (2, 1000)
     rounded = {"D_LRBG": round(metres["D_LRBG"] / unit)}

@@ -19,15 +19,15 @@ Element = ElementTree.Element
 class XmlLine:
     """Line of a GPX or KML file, n points."""
 
-    fields: dict[str, str]  #: ``name``, blank where the file has none, and ``ExtendedData`` of KML.
+    fields: dict[str, str]  #: ``name``, blank if absent, and the KML ``ExtendedData``.
     points: Floats  #: Longitude, latitude [deg] and height as written [m], NaN where missing; shape (n, 3).
-    geoid_m: Floats  #: ``geoidheight`` of GPX, NaN where missing; shape (n,).
-    time: tuple[str, ...]  #: UTC as written, blank where missing; n strings.
+    geoid_m: Floats  #: GPX ``geoidheight``, NaN where missing; shape (n,).
+    time: tuple[str, ...]  #: UTC times as written, blank where missing; n strings.
 
 
 def read_root(path: FilePath) -> Element:
     """Return the root element of an XML file; raise InputFileError if the file is not XML."""
-    content = read_bytes(path).rstrip(b"\0")  # a power cut leaves zeros behind
+    content = read_bytes(path).rstrip(b"\0")  # a power cut may leave zero bytes at the end
     try:
         text: str | bytes = content.decode("utf-8")
     except UnicodeDecodeError:  # the parser uses the encoding that the file declares
@@ -70,9 +70,9 @@ def read_gpx_lines(path: FilePath) -> list[XmlLine]:
 
 
 def read_kml_lines(path: FilePath) -> list[XmlLine]:
-    """Return the lines and tracks of a KML file; heights that are clamped to the ground are ignored.
+    """Return the lines and tracks of a KML file. Heights of lines that are clamped to the ground are ignored.
 
-    Raise InputFileError if a coordinate is not a number, or heights are relative to the ground or the sea floor.
+    Raise InputFileError if a coordinate is not a number, or if heights are relative to the ground or sea floor.
     """
     lines = []
     for mark in (element for element in read_root(path).iter() if tag(element) == "Placemark"):
@@ -97,7 +97,7 @@ def read_kml_lines(path: FilePath) -> list[XmlLine]:
 
 
 def _kml_cells(part: Element) -> Iterator[Sequence[str | None]]:
-    """Yield longitude, latitude and, where written, height of each point of a LineString or gx:Track."""
+    """Yield longitude, latitude and height (if written) of each point in a LineString or gx:Track."""
     for child in part:
         if tag(child) == "coordinates":
             yield from ([*text.split(",")] for text in (child.text or "").replace(", ", ",").split())
@@ -106,7 +106,7 @@ def _kml_cells(part: Element) -> Iterator[Sequence[str | None]]:
 
 
 def _numbers(path: FilePath, where: str, cells: Sequence[str | None]) -> list[float]:
-    """Return a point's cells (longitude, latitude, ...) as numbers; raise InputFileError if they are invalid."""
+    """Return a point's coordinates as numbers. Raise InputFileError if they are invalid."""
     if comma := next((cell for cell in cells if "," in str(cell)), None):
         raise InputFileError(path, f"{where}: {comma} has a comma in a number; a decimal point was expected")
     try:

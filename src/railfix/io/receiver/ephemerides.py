@@ -1,9 +1,9 @@
-"""Assemble ephemerides from navigation subframes in the order of a stream.
+"""Assemble ephemerides from the navigation subframes of a stream.
 
 A record needs several subframes of one issue: three for GPS and QZSS, five words (I/NAV) or four pages (F/NAV) for
-Galileo, three (D1, B-CNAV1, B-CNAV2) or ten pages (D2) for BeiDou, and four strings for GLONASS. `assemble_records`
-combines the subframes of one piece of a stream with the subframes of earlier pieces, so that the records do not depend
-on the division of the stream into pieces.
+Galileo, three subframes (D1, B-CNAV1, B-CNAV2) or ten pages (D2) for BeiDou, and four strings for GLONASS. A stream is
+decoded in pieces. `assemble_records` combines the subframes of one piece with those of earlier pieces, so a record may
+extend over several pieces.
 """
 
 from __future__ import annotations
@@ -44,22 +44,22 @@ from railfix.io.rinex.navigation_records import RawRecord, first_fault, glonass_
 
 #: Constellation letter by number of an RTCM ephemeris message.
 _RTCM_SYSTEMS: Final = {1019: "G", 1044: "J", 1042: "C", 1045: "E", 1046: "E", 1020: "R"}
-_STRINGS_S: Final = 15.0  #: Time from the beginning of a GLONASS frame within which strings 1 to 4 are sent [s].
-_EPOCH_BEFORE_S: Final = 5.0  #: Longest time between a GLONASS string and the epoch that gives the string its time [s].
+_STRINGS_S: Final = 15.0  #: GLONASS strings 1 to 4 are sent in less than this time from the frame start [s].
+_EPOCH_BEFORE_S: Final = 5.0  #: Longest time from an epoch to a GLONASS string that is dated with it [s].
 #: Duration of a GLONASS frame [s].
 _FRAME_S: Final = 30.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Unfinished:
-    """Unfinished records after a piece of a stream."""
+    """State of the ephemeris assembly after a piece of a stream."""
 
     #: Fields of the latest subframe by satellite and subframe number.
     latest: Mapping[tuple[str, int], Values] = field(default_factory=dict)
-    #: Issue of the last record by satellite and message; a record with the same issue is a repetition.
+    #: Issue of the last record by satellite and message. A new record with the same issue is a repetition.
     issued: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    #: For each GLONASS satellite with all four strings, the first epoch after the last string; NaT if not yet received.
-    #: The strings may be from different frames.
+    #: First epoch after the last string, NaT if not yet received, for each GLONASS satellite whose four strings are
+    #: complete. The strings may be from different frames.
     waiting: Mapping[str, np.datetime64] = field(default_factory=dict)
 
 
@@ -72,7 +72,7 @@ class Assembled:
     klobuchar: Mapping[str, np.ndarray]
     leap_seconds: int | None
     skipped: Mapping[str, int]
-    undated: frozenset[str] = frozenset()  #: Satellites with subframes whose date is unknown.
+    undated: frozenset[str] = frozenset()  #: Satellites with records that could not be dated.
 
 
 def assemble_records(
@@ -101,7 +101,7 @@ def assemble_records(
 def assemble_rtcm(
     messages: Iterable[tuple[int, int, Mapping[str, float]]], time: Datetimes, state: Unfinished
 ) -> tuple[Assembled, Unfinished]:
-    """Return the ephemerides of RTCM 3 messages without repetitions, and the decoder's state after the messages.
+    """Return the ephemerides in RTCM 3 messages, without repetitions, and the state after the messages.
 
     `messages` is from `rtcm.ephemeris_fields`, and `time` is the time of reception of each message, shape (N,).
     """
@@ -152,9 +152,9 @@ class _EphemerisBuilder:
         self.leap_seconds: int | None = None
 
     def needs_date(self, satellite: str, time: np.datetime64) -> bool:
-        """Return whether a record cannot be dated; if so, add the satellite to `undated`.
+        """Return whether a date is missing for a record; if so, add the satellite to `undated`.
 
-        GPS and QZSS send ten bits of the week, and GLONASS sends only the time of day.
+        GPS and QZSS send only ten bits of the week, and GLONASS sends only the time of day.
         """
         if satellite[0] in "GJR" and np.isnat(time):
             self.undated.add(satellite)
@@ -162,7 +162,7 @@ class _EphemerisBuilder:
         return False
 
     def result(self, counts: Counter[str]) -> tuple[Assembled, Unfinished]:
-        """Return the completed records with the counts, and the unfinished records."""
+        """Return the completed records, with the counts of rejected ones added to `counts`, and the new state."""
         counts.update(f"{raw.satellite[0]} {why}" for raw, why in self.rejected)
         records = Assembled(
             records=tuple(self.records),
@@ -175,7 +175,7 @@ class _EphemerisBuilder:
         return records, Unfinished(latest=self.latest, issued=self.issued, waiting=self.waiting)
 
     def add(self, satellite: str, number: int, values: Values, time: np.datetime64, after: np.datetime64) -> None:
-        """Add a subframe received between two epochs, and append the record that it completes."""
+        """Add a subframe received between the epochs `time` and `after`, and append any record that it completes."""
         letter = satellite[0]
         if letter == "R":
             self.waiting.pop(satellite, None)
@@ -202,9 +202,9 @@ class _EphemerisBuilder:
         return {"G": self._gps, "J": self._gps, "E": self._galileo, "R": self._glonass}[letter]
 
     def settle(self, until: np.datetime64 | None) -> None:
-        """Append the records of complete GLONASS strings for which the next epoch is known.
+        """Append the GLONASS records that wait for an epoch after their last string, if this epoch is known.
 
-        Unless `until` is None, only strings with a next epoch not after `until` are used.
+        If `until` is given, only records whose epoch is at or before `until` are appended.
         """
         for satellite, after in list(self.waiting.items()):
             if not np.isnat(after) and (until is None or after <= until):
@@ -212,7 +212,7 @@ class _EphemerisBuilder:
                 self.issue(self._glonass(satellite, after, within=_FRAME_S), after)
 
     def issue(self, record: Record | None, time: np.datetime64) -> None:
-        """Append a record unless it repeats the satellite's last record of the same message, or is implausible."""
+        """Append a record, except if it is implausible or repeats the satellite's last record of the same message."""
         if record is None:
             return
         raw, issue = record
@@ -232,7 +232,7 @@ class _EphemerisBuilder:
         return None if any(part is None for part in parts) else [part for part in parts if part is not None]
 
     def _ionosphere_gps(self, letter: str, values: Values) -> None:
-        # Page 18 of GPS and the wide-area page of QZSS have identity 56; the QZSS page for Japan has 61.
+        # GPS page 18 and the QZSS page for the wide area have identity 56; the QZSS page for Japan has identity 61.
         if values["page_sv"] == 56 and values["data_id"] in (1, 3):
             self.klobuchar[letter] = np.array([values[f"ion{k}"] for k in range(8)])
             self.leap_seconds = int(values["leap_seconds"]) if letter == "G" else self.leap_seconds
@@ -284,7 +284,7 @@ class _EphemerisBuilder:
         return bcnav_record(satellite, "CNV2", {**parts[2], **parts[1], **parts[0]})
 
     def _bcnav1(self, satellite: str, _: np.datetime64) -> Record | None:
-        """Return the B-CNAV1 record if the pages are of one frame and the last page has the health, else None."""
+        """Return the B-CNAV1 record if the pages are of one frame and the last page contains the health, else None."""
         parts = self._parts(satellite, tuple(BCNAV1_FROM + k for k in nav_messages.BCNAV1))
         if parts is None or len({part["tow_s"] for part in parts}) != 1:
             return None
@@ -316,9 +316,9 @@ class _EphemerisBuilder:
             return None
         if self.needs_date(satellite, time):
             return None
-        # All strings belong to one frame, which begins at the time t_k in string 1; one string is sent every 2 s.
-        # String 1 may have come before the receiver's first epoch, so that its time of reception is unknown; where
-        # epochs are lost or rare, the first epoch after all strings shows that no later frame can have begun.
+        # All strings must be of one frame, which begins at the time t_k in string 1; one string is sent every 2 s. The
+        # time of string 1 is not tested, because it may precede the receiver's first epoch. If epochs are lost or rare,
+        # the first epoch after the strings is tested instead: it must be within one frame length of t_k.
         began = frame_time(parts[0], time)
         if within is None:
             received = np.array([part["received"] for part in parts[1:]]).astype(np.int64).astype("datetime64[ns]")
@@ -333,7 +333,7 @@ class _EphemerisBuilder:
 
 
 def merge_records(parts: list[Assembled]) -> Assembled:
-    """Join the records of several pieces of one stream; the last Klobuchar coefficients and leap seconds are used."""
+    """Join the records of several pieces of one stream. The last Klobuchar coefficients and leap seconds are used."""
     klobuchar: dict[str, np.ndarray] = {}
     leap: int | None = None
     for part in parts:

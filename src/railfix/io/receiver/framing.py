@@ -1,4 +1,4 @@
-"""Find frames of UBX, RTCM 3, SBF and NMEA, also mixed, in a byte stream, and verify their checksums.
+"""Find the UBX, RTCM 3, SBF and NMEA frames in a byte stream, and verify their checksums. Protocols may be mixed.
 
 Sources: u-blox F9 HPG interface description (UBX-20033635), section 3; RTCM 10403.3, section 4; Septentrio mosaic-X5
 reference guide, section 4.1 (SBF); NMEA 0183, section 5.3.
@@ -22,11 +22,11 @@ from railfix.core.files import FilePath, open_stream
 LONGEST_FRAME: Final = 16_384
 _NMEA_LONGEST: Final = 512
 _LETTERS: Final = b"\x00ABCDEFGHIJKLMNOPQRSTUVWXYZ"
-#: Whether a byte is valid as the first and as the second character of an NMEA address; 0 (the end of the buffer) is
-#: valid.
+#: Whether each byte is valid as the first (row 0) and second (row 1) character of an NMEA address. The byte 0, which is
+#: read beyond the end of the buffer, is valid.
 _ADDRESS: Final = np.array([[c in text for c in range(256)] for text in (_LETTERS, _LETTERS + b"0123456789")])
 
-#: Value of each byte as a hexadecimal digit; 255 for bytes that are no such digit.
+#: Value of each byte as a hexadecimal digit; 255 for other bytes.
 _HEX: Final = np.full(256, 255)
 _HEX[np.frombuffer(b"0123456789ABCDEFabcdef", np.uint8)] = [*range(16), *range(10, 16)]
 
@@ -38,26 +38,26 @@ class Frames:
     data: Bytes  #: Buffer that contains the frames.
     protocol: Strings  #: "ubx", "rtcm3", "sbf" or "nmea"; shape (N,).
     kind: Integers  #: UBX: class * 256 + id; RTCM 3: message number; SBF: block number; NMEA: 0; shape (N,).
-    #: Start and end of the payload in `data`, shape (N,). The payload of UBX and RTCM 3 excludes header and checksum,
-    #: but includes the RTCM message number. The payload of SBF begins at the time stamp, after the header of 8 bytes.
-    #: The payload of NMEA is the text from ``$`` to before ``*``.
+    #: Start and end of the payload in `data`, shape (N,). A UBX or RTCM 3 payload excludes header and checksum; the
+    #: RTCM message number is included. An SBF payload begins at the time stamp, after the header of 8 bytes. An NMEA
+    #: payload is the text from ``$`` to the character before ``*``.
     start: Indices
     end: Indices
-    frame_start: Indices  #: Offset of the first byte of the frame, sync included; shape (N,).
+    frame_start: Indices  #: Offset of the first sync byte of the frame, shape (N,).
     consumed: int  #: Number of processed bytes of the buffer; the rest may be the start of a frame.
     skipped_bytes: int  #: Number of processed bytes outside frames.
-    bad_checksums: int  #: Number of complete frame candidates with a wrong checksum that begin outside all frames.
+    bad_checksums: int  #: Number of complete frames with a wrong checksum that begin outside all valid frames.
 
     def __len__(self) -> int:
         return len(self.start)
 
     def of(self, protocol: str, *kinds: int) -> Indices:
-        """Return the indices of the frames of a protocol, of the given kinds or of all kinds."""
+        """Return the indices of a protocol's frames of the given kinds; without kinds, of all its frames."""
         own = self._by_protocol.get(protocol, np.empty(0, dtype=np.intp))
         return own[np.isin(self.kind[own], kinds)] if kinds and len(own) else own
 
     def structures(self, protocol: str, kinds: Iterable[int], layout: np.dtype) -> tuple[Indices, np.ndarray]:
-        """Return the indices of frames of the given kinds that are long enough for a layout, and the frames' fields."""
+        """Return the indices of frames of the given kinds that are long enough for `layout`, and their fields."""
         chosen = self.of(protocol, *kinds)
         chosen = chosen[self.end[chosen] - self.start[chosen] >= layout.itemsize]
         return chosen, gather_structures(self.data, self.start[chosen], layout)
@@ -69,7 +69,7 @@ class Frames:
 
 
 def gather_structures(data: Bytes, start: np.ndarray, layout: np.dtype) -> np.ndarray:
-    """Return the structures of one layout at many offsets of a buffer, shape (N,)."""
+    """Return the structures with the fields `layout` at the offsets `start` of a buffer, shape (N,)."""
     block = data[start[:, None] + np.arange(layout.itemsize)] if len(start) else np.zeros((0, layout.itemsize), "u1")
     return np.ascontiguousarray(block).view(layout)[:, 0]
 
@@ -88,7 +88,7 @@ class _FrameCandidates:
 
 
 def find_frames(data: Bytes, *, at_end: bool = True) -> Frames:
-    """Find the frames in a buffer of uint8; an incomplete last frame is skipped with `at_end`, else not consumed."""
+    """Find the frames in a buffer of bytes. An incomplete last frame is skipped if `at_end`, else not consumed."""
     data = np.asarray(data, dtype=np.uint8)
     candidates = [_ubx(data), _rtcm(data), _sbf(data), _nmea(data, at_end=at_end)]
     incomplete = [c.frame[c.frame_end > len(data)] for c in candidates]
@@ -137,7 +137,7 @@ def _without_overlap(start: Indices, end: Integers, valid: Masks) -> Indices:
 
 
 def _outside(places: Indices, start: Indices, end: Integers) -> int:
-    """Return the number of offsets outside all accepted frames."""
+    """Return how many of the offsets `places` are outside all accepted frames."""
     if not len(start):
         return len(places)
     before = np.searchsorted(start, places, side="right") - 1
@@ -162,7 +162,7 @@ def _ubx(data: Bytes) -> _FrameCandidates:
     start, end = frame + 6, frame + 6 + length
     complete = end + 2 <= len(data)
     valid = np.zeros(len(frame), dtype=bool)
-    # Fletcher's checksum of all frames from two running sums: A = sum b, B = sum of A, both from the class byte on.
+    # Fletcher checksum from running sums: A is the sum of the bytes from the class byte on, B the sum of all A.
     sums = np.concatenate([[0], np.cumsum(data, dtype=np.int64)])
     double = np.concatenate([[0], np.cumsum(sums[1:])])
     a0, a1 = frame[complete] + 2, end[complete]
@@ -225,7 +225,7 @@ def _nmea(data: Bytes, *, at_end: bool) -> _FrameCandidates:
     return _FrameCandidates("nmea", frame, np.zeros(len(frame), np.int64), frame, end, frame_end, valid)
 
 
-#: Number of first bytes in which a log must have a frame with a valid checksum to be recognised.
+#: A log is recognised if this number of first bytes contains a frame with a valid checksum.
 _HEAD_BYTES: Final = 1 << 16
 
 
@@ -236,20 +236,20 @@ def is_receiver_log(head: bytes) -> bool:
 
 
 def read_head(path: FilePath) -> bytes:
-    """Return the first bytes of a file after decompression."""
+    """Return the first `_HEAD_BYTES` bytes of a file after decompression."""
     with open_stream(path, content="bytes") as stream:
         return stream.read(_HEAD_BYTES)
 
 
-#: Field of a message: first bit, number of bits, factor and coding ("u" unsigned, "s" two's complement, "m" sign and
-#: magnitude). A field in pieces has a tuple of (first bit, number of bits) pairs in place of the first bit.
+#: Field of a message: first bit, number of bits, scale factor and coding ("u" unsigned, "s" two's complement, "m" sign
+#: and magnitude). A divided field has a tuple of (first bit, number of bits) pairs instead of the first bit.
 Field = tuple[int | tuple[tuple[int, int], ...], int, float, str]
 
 _LONGEST: Final = 62
 
 
 def read_unsigned(bits: Bytes, first: int, length: int) -> Integers:
-    """Return the unsigned integers, shape (N,), in a bit field of N messages, `bits` of shape (N, bits).
+    """Return the unsigned integers in a bit field of N messages, shape (N,). `bits` has the shape (N, bits).
 
     Raise ValueError if the field has over 62 bits.
     """
@@ -262,19 +262,19 @@ def read_unsigned(bits: Bytes, first: int, length: int) -> Integers:
 
 
 def read_signed(bits: Bytes, first: int, length: int) -> Integers:
-    """Return the integers in two's complement in a bit field, shape (N,)."""
+    """Return the two's complement integers in a bit field, shape (N,)."""
     value = read_unsigned(bits, first, length)
     return np.where(value >> (length - 1) & 1, value - (1 << length), value)
 
 
 def sign_magnitude(bits: Bytes, first: int, length: int) -> Integers:
-    """Return the integers coded as sign and magnitude (GLONASS) in a bit field, shape (N,)."""
+    """Return the sign-magnitude integers (GLONASS) in a bit field, shape (N,)."""
     value = read_unsigned(bits, first + 1, length - 1)
     return np.where(bits[:, first] == 1, -value, value)
 
 
 def fields(bits: Bytes, layout: Mapping[str, Field]) -> dict[str, Floats]:
-    """Return all fields of a layout by name, scaled, shape (N,) each, from bits of shape (N, bits)."""
+    """Return the scaled values of all fields of a layout by name, shape (N,) each. `bits` has the shape (N, bits)."""
     values = {}
     for name, (where, length, factor, coding) in layout.items():
         if isinstance(where, tuple):
@@ -289,14 +289,14 @@ def fields(bits: Bytes, layout: Mapping[str, Field]) -> dict[str, Floats]:
 
 @dataclass(frozen=True, kw_only=True)
 class Subframes(RowArrays):
-    """Raw navigation words in the layout of UBX, N rows in the order of the stream."""
+    """Raw navigation subframes in the layout of UBX RXM-SFRBX, N rows in the order of the stream."""
 
     satellite: Strings
-    signal: Integers  #: Signal number as UBX sigId, also for other formats; shape (N,).
+    signal: Integers  #: UBX signal number (sigId), also used for other formats; shape (N,).
     glonass_channel: Integers  #: Frequency channel of a GLONASS satellite, shape (N,).
     #: Words of 30 or 32 bits, right-aligned; unused words are 0; shape (N, 10).
     words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]
-    order: Integers  #: Offset in the stream, which determines the preceding epoch; shape (N,).
+    order: Integers  #: Offset in the stream, shape (N,).
     skipped: Mapping[str, int] = field(default_factory=dict)  #: Number of skipped pages by reason.
 
     def __len__(self) -> int:
@@ -317,9 +317,9 @@ SBAS_L5, BCNAV1_PAGE = -5, -6
 
 @dataclass(frozen=True, kw_only=True)
 class SbasFrames:
-    """SBAS messages as output by a receiver, N rows; preamble and parity are not checked."""
+    """SBAS messages output by a receiver, N rows. Preamble and parity have not been checked."""
 
-    #: 1 ns after the last epoch before the message, NaT before the first time of the log; shape (N,).
+    #: Time of the last epoch before the message plus 1 ns, shape (N,); NaT before the first time in the log.
     time: Datetimes
 
     prn: Integers  #: PRN of the satellite, shape (N,).
@@ -331,7 +331,7 @@ class SbasFrames:
 
 
 def sbas_frames(subframes: Subframes, time: Datetimes) -> SbasFrames:
-    """Return the SBAS messages among subframes; each has eight words of 32 bits (UBX-22008968, 3.17.9)."""
+    """Return the SBAS messages among subframes. A message has eight words of 32 bits (UBX-22008968, 3.17.9)."""
     rows = np.flatnonzero(np.char.startswith(subframes.satellite, "S"))
     octets = subframes.words[rows, :8].astype(">u4").view(np.uint8).reshape(len(rows), 32).copy()
     octets[:, 31] &= 0xC0
@@ -341,7 +341,7 @@ def sbas_frames(subframes: Subframes, time: Datetimes) -> SbasFrames:
 
 
 def unpack_words(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]], *, drop: int, keep: int) -> Bytes:
-    """Return the `keep` bits above the lowest `drop` bits of each word, shape (N, words * keep)."""
+    """Drop the lowest `drop` bits of each word, and return the next `keep` bits, shape (N, words * keep)."""
     shift = np.arange(keep - 1, -1, -1, dtype=np.uint32) + np.uint32(drop)
     bits = words[:, :, None] >> shift & np.uint32(1)
     return bits.reshape(len(words), words.shape[1] * keep).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Read receiver logs (UBX, RTCM 3, SBF, also mixed) in pieces, with interference indicators and receiver positions.
+"""Read observations, ephemerides, interference indicators and positions from receiver logs (UBX, RTCM 3, SBF).
 
 Sources: u-blox interface descriptions F9 HPG 1.32 (UBX-22008968), sections 3.14.5 (MON-RF), 3.14.2 (MON-HW), and X20
 HPG 2.00 (SEC-SIG 1 and 2, SEC-SIGLOG); Septentrio mosaic-X5 reference guide 4.14, section 4.2.14 (both status blocks).
@@ -40,17 +40,17 @@ RF_STATUS: Final = 4092
 RECEIVER_STATUS: Final = 4014
 
 JAMMING, SPOOFING = 1, 2  #: Bits of `Observations.receiver_alarm`.
-#: Lowest u-blox state that sets an alarm (jamming critical, spoofing affirmed). State 2 (warning, indicated) was sent
-#: for 571 of 581 s of a recording without interference.
+#: Lowest u-blox state that sets an alarm (jamming critical, spoofing affirmed). State 2 (jamming warning, spoofing
+#: indicated) sets none, because it was sent in 571 of the 581 s of a recording without interference.
 _CERTAIN: Final = 3
-_NOT_MITIGATED: Final = 8  #: Value of Septentrio's mode field for interference that is not mitigated.
+_NOT_MITIGATED: Final = 8  #: Value of the Septentrio mode field for unmitigated interference.
 _MON_HW_BYTES: Final = 60
-_BLOCK: Final = 24  #: Bytes of each MON-RF block of u-blox, after a header of four bytes.
-_BANDS, _FRONT_ENDS = 12, 24  #: Offsets of Septentrio's first band block and first front-end block in the payload.
+_BLOCK: Final = 24  #: Bytes of each block in u-blox MON-RF; the header before the blocks has four bytes.
+_BANDS, _FRONT_ENDS = 12, 24  #: Payload offset of the first block in RFStatus and in ReceiverStatus.
 _NO_GAIN: Final = -128
 _EVENT: Final = 8  #: Bytes of each event in u-blox SEC-SIGLOG.
-_TRIGGERED_S: Final = 10  #: Time for which a single-trigger event of SEC-SIGLOG sets the alarm [s].
-_SIMULATED: Final = 0  #: SEC-SIGLOG detection type of simulated signals, the only type that sets an alarm.
+_TRIGGERED_S: Final = 10  #: Duration of the alarm that a single-trigger event of SEC-SIGLOG sets [s].
+_SIMULATED: Final = 0  #: SEC-SIGLOG detection type "simulated signal"; no other type sets an alarm.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -58,11 +58,11 @@ class Indicators:
     """Latest interference indicators of a receiver."""
 
     alarm: Mapping[int, int] = field(default_factory=dict)  #: Alarm bits by kind of message.
-    gain: float = np.nan  #: Front-end gain, NaN before the first gain.
+    gain: float = np.nan  #: Front-end gain in the receiver's unit, NaN before the first gain.
 
 
 def indicators_at(frames: Frames, places: Integers, before: Indicators) -> tuple[Bytes, Floats, Indicators]:
-    """Return alarm bits and gain at ascending offsets `places`, shape (T,), and the indicators after all messages."""
+    """Return the alarm bits and the gain at ascending offsets `places`, shape (T,) each, and the latest indicators."""
     found = sorted(_messages(frames))
     alarm, gain = dict(before.alarm), before.gain
     alarms, gains = np.zeros(len(places), dtype=np.uint8), np.full(len(places), np.nan)
@@ -79,7 +79,7 @@ def indicators_at(frames: Frames, places: Integers, before: Indicators) -> tuple
 
 
 def _messages(frames: Frames) -> Iterator[tuple[int, int, int, float]]:
-    """Yield the offset in the stream, the kind, the alarm bits and the gain of each valid message with indicators."""
+    """Yield the offset in the stream, kind, alarm bits and gain of each valid interference message."""
     readers = {
         ("ubx", MON_RF): _mon_rf,
         ("ubx", MON_HW): _mon_hw,
@@ -96,7 +96,7 @@ def _messages(frames: Frames) -> Iterator[tuple[int, int, int, float]]:
 
 
 def _mon_rf(data: Bytes) -> tuple[int, float] | None:
-    """Return the jamming bit, which any band sets, and the gain of the first band; None for a malformed message."""
+    """Return the jamming bit, set if any band is jammed, and the gain of the first band; None if malformed."""
     if len(data) < 4 + _BLOCK or len(data) != 4 + _BLOCK * int(data[1]):
         return None
     blocks = data[4:].reshape(-1, _BLOCK)
@@ -105,14 +105,14 @@ def _mon_rf(data: Bytes) -> tuple[int, float] | None:
 
 
 def _mon_hw(data: Bytes) -> tuple[int, float] | None:
-    """Return the jamming bit and gain from receivers up to the M8; None for a malformed message."""
+    """Return the jamming bit and the gain (receivers up to the M8 generation); None if malformed."""
     if len(data) != _MON_HW_BYTES:
         return None
     return JAMMING * ((int(data[22]) >> 2 & 3) >= _CERTAIN), float(data[18]) + 256.0 * float(data[19])
 
 
 def _sec_sig(data: Bytes) -> tuple[int, float] | None:
-    """Return the jamming and spoofing bits, which are 0 if the detection is off; None for an unknown version."""
+    """Return the jamming and spoofing bits, or None for an unknown version. A bit is 0 if its detection is off."""
     if len(data) >= 12 and data[0] == 1:
         jamming, spoofing = int(data[4]), int(data[8])
     elif len(data) >= 4 and data[0] == 2:
@@ -124,7 +124,7 @@ def _sec_sig(data: Bytes) -> tuple[int, float] | None:
 
 
 def _sec_siglog(data: Bytes) -> tuple[int, float] | None:
-    """Return the spoofing bit, set if simulated signals have begun and not ended, or were triggered within 10 s.
+    """Return the spoofing bit. It is set while a simulated signal lasts, and for 10 s after a single-trigger event.
 
     Events of abnormal signals, inconsistent inertial data and abrupt changes are ignored, because tunnels cause them.
     Jamming events are ignored, because they begin with a warning. Return None for a malformed message.
@@ -138,7 +138,7 @@ def _sec_siglog(data: Bytes) -> tuple[int, float] | None:
 
 
 def _rf_status(data: Bytes) -> tuple[int, float] | None:
-    """Return the bits of jamming (not mitigated) and spoofing (misleading, unauthentic); None if malformed."""
+    """Return the jamming bit (interference not mitigated) and the spoofing bit (misleading or unauthentic signal)."""
     if len(data) < _BANDS:
         return None
     count, size, flags = int(data[6]), int(data[7]), int(data[8])
@@ -149,7 +149,7 @@ def _rf_status(data: Bytes) -> tuple[int, float] | None:
 
 
 def _receiver_status(data: Bytes) -> tuple[int, float] | None:
-    """Return the gain of the first front end [dB], NaN if unavailable; None for a malformed message."""
+    """Return the gain of the first front end [dB], NaN if unavailable; None if malformed."""
     if len(data) < _FRONT_ENDS or int(data[20]) < 1 or len(data) < _FRONT_ENDS + int(data[21]):
         return None
     gain = int(data[_FRONT_ENDS + 1 : _FRONT_ENDS + 2].view(np.int8)[0])
@@ -160,7 +160,7 @@ _BLOCK_BYTES = 1 << 22
 
 
 def read_receiver_positions(path: FilePath, *, date: np.datetime64 | None = None) -> PositionLog:
-    """Read a receiver's positions; UBX logs without a dated NAV-PVT message need a `date` within half a week."""
+    """Read a receiver's positions. UBX logs without a dated NAV-PVT message need a `date` within half a week."""
     parts = []
     near = np.datetime64("NaT", "ns") if date is None else date.astype("datetime64[ns]")
     undated, rest = 0, b""
@@ -213,18 +213,18 @@ class StreamState:
     rest: bytes = b""  #: Bytes that are not yet processed: an incomplete frame or epoch.
     subframes: Unfinished = field(default_factory=Unfinished)
     messages: Unfinished = field(default_factory=Unfinished)
-    #: Time of the last epoch; before the first epoch, a time within half a week of the stream, NaT if unknown.
+    #: Time of the last epoch. Before the first epoch, a time within half a week of the stream, or NaT if unknown.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     glonass_channels: Mapping[int, int] = field(default_factory=dict)
     observed: bool = False  #: Whether UBX or SBF measurements with a time have been decoded.
-    kind: str = ""  #: Kind of observation messages used, blank before the first epoch.
+    kind: str = ""  #: Kind of observation messages that are used; blank before the first epoch.
     clock: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Latest time in any message.
     indicators: Indicators = field(default_factory=Indicators)
     station: tuple[float, float, float] | None = None  #: `LogPiece.station`.
 
 
 def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[LogPiece, StreamState]:
-    """Decode a block of bytes, which may end anywhere in the stream; return the decoded piece and the new state."""
+    """Decode a block of bytes, which need not end at a message boundary. Return the decoded piece and the new state."""
     buffer = np.frombuffer(state.rest + data, dtype=np.uint8)
     frames = find_frames(buffer, at_end=at_end)
     if not at_end:
@@ -276,7 +276,7 @@ def decode(data: bytes, state: StreamState, *, at_end: bool = False) -> tuple[Lo
 
 
 def _of_old_kinds(frames: Frames) -> dict[str, int]:
-    """Return the number of observation messages of each unsupported kind: RTCM 3 before MSM4, u-blox before the M8."""
+    """Return the number of observation messages of each unsupported kind (RTCM 3 other than MSM4 to 7, UBX RXM-RAW)."""
     small = (start + n for start in range(1070, 1140, 10) for n in (1, 2, 3))
     kinds = (*range(1001, 1005), *range(1009, 1013), *small)
     counts = {f"RTCM {kind}": len(frames.of("rtcm3", kind)) for kind in kinds}
@@ -295,7 +295,7 @@ def _places(frames: Frames, kind: str) -> Integers:
 
 
 def _first_kind(frames: Frames, own: Mapping[str, Measurements], msm_places: Integers) -> str:
-    """Return the kind of message of the first dated epoch, "" if there is none; other kinds repeat the same ranges."""
+    """Return the kind of the first dated observations, or "". Other kinds are not used; they repeat the same data."""
     begins = {kind: _places(frames, kind)[-len(part.time)] for kind, part in own.items() if len(part.time)}
     if len(msm_places):
         begins[_MSM] = msm_places[0]
@@ -309,26 +309,26 @@ def _of_other_kinds(frames: Frames, kind: str) -> dict[str, int]:
 
 
 class _Dated(NamedTuple):
-    """Offsets and times of epochs, or of other messages with a date, in the order of the stream."""
+    """Offsets and times of epochs, or of other messages that have a date, in the order of the stream."""
 
     places: Integers
     times: Datetimes
 
     def last_before(self, places: Integers, before: np.datetime64) -> Datetimes:
-        """Return the time of the last epoch before each offset of the stream, `before` where there is none."""
+        """Return the time of the last epoch before each offset, or `before` if no epoch precedes the offset."""
         if not len(self.times):
             return np.full(len(places), before, dtype="datetime64[ns]")
         index = np.searchsorted(self.places, places) - 1
         return np.where(index < 0, before, self.times[np.maximum(index, 0)])
 
     def first_after(self, places: Integers) -> Datetimes:
-        """Return the time of the first epoch after each offset of the stream; NaT where there is none."""
+        """Return the time of the first epoch at or after each offset, or NaT if no epoch follows."""
         times = np.append(self.times, np.datetime64("NaT", "ns"))
         return np.asarray(times[np.searchsorted(self.places, places)])
 
 
 def _date(frames: Frames, raw: Measurements, epochs_at: Integers, *, observed: bool) -> _Dated:
-    """Return the receiver's epochs; before the first epoch of the stream, the times of other messages with a date."""
+    """Return the receiver's epochs. Before the first epoch of the stream, times are taken from other dated messages."""
     epochs_at = epochs_at[len(epochs_at) - len(raw.time) :]
     if observed:
         return _Dated(epochs_at, raw.time)
@@ -343,7 +343,7 @@ def _date(frames: Frames, raw: Measurements, epochs_at: Integers, *, observed: b
 def _navigation(
     frames: Frames, dated: _Dated, msm: _Dated, state: StreamState
 ) -> tuple[Assembled, SbasFrames, Unfinished, Unfinished]:
-    """Return the ephemerides and SBAS messages of a block, and unfinished records; `msm` are the epochs of RTCM 3."""
+    """Return the ephemerides and SBAS messages of a block, and the unfinished records of subframes and of RTCM 3."""
     subframes = join_subframes(ubx.sfrbx_subframes(frames), sbf.navigation_subframes(frames))
     received = dated.last_before(subframes.order, state.time if np.isnat(state.clock) else state.clock)
     after = dated.first_after(subframes.order)
@@ -363,8 +363,8 @@ def scan_pieces(
 ) -> Iterator[LogPiece]:
     """Yield the pieces of a receiver log.
 
-    `progress` is called with the fraction of the file read. `date`, within half a week of the log, resolves the week of
-    RTCM 3 logs without ephemerides. Raise MismatchError if the ephemerides contradict the date.
+    `progress` is called with the fraction of the file read. `date` must be within half a week of the log; it resolves
+    the week of RTCM 3 logs without ephemerides. Raise MismatchError if the ephemerides contradict the date.
     """
     state = StreamState(time=_week_of_log(path, date))
     with open_stream(path, content="bytes") as stream:
@@ -378,11 +378,11 @@ def scan_pieces(
                 return
 
 
-_SAME_WEEK: Final = np.timedelta64(5, "D")  #: Largest accepted difference between date and ephemerides.
+_SAME_WEEK: Final = np.timedelta64(5, "D")  #: Largest accepted difference between `date` and ephemerides.
 
 
 def _week_of_log(path: FilePath, date: np.datetime64 | None) -> np.datetime64:
-    """Return the time of an RTCM 3 log's first ephemerides, else `date`, else NaT; raise MismatchError on conflict."""
+    """Return the time of an RTCM 3 log's first ephemerides; without ephemerides, `date`; without both, NaT."""
     own: np.datetime64 = np.datetime64("NaT", "ns")
     rest = b""
     with open_stream(path, content="bytes") as stream:
@@ -400,7 +400,7 @@ def _week_of_log(path: FilePath, date: np.datetime64 | None) -> np.datetime64:
 
 
 def at_station(observations: Observations, station: tuple[float, float, float] | None) -> Observations:
-    """Return the observations with the position of the base station in the header, unchanged if `station` is None."""
+    """Return the observations with the base station's position in the header, or unchanged if `station` is None."""
     if station is None:
         return observations
     return replace(observations, header=replace(observations.header, approximate_ecef_m=np.array(station)))
@@ -409,7 +409,7 @@ def at_station(observations: Observations, station: tuple[float, float, float] |
 def scan_receiver_log(
     path: FilePath, *, date: np.datetime64 | None = None, progress: Callable[[float], None] | None = None
 ) -> Iterator[Observations]:
-    """Yield the observations of a receiver log by blocks; raise InputFileError if no observation can be dated."""
+    """Yield the observations of a receiver log in blocks. Raise InputFileError if no observation can be dated."""
     tracking = Tracking()
     epochs = frames_seen = undated = 0
     old: Counter[str] = Counter()
@@ -437,7 +437,7 @@ def scan_receiver_log(
 
 
 def read_receiver_navigation(paths: Iterable[FilePath], *, date: np.datetime64 | None = None) -> Navigation:
-    """Read the navigation records of receiver logs; raise InputFileError if no record is complete and has a date."""
+    """Read the navigation records of receiver logs. Raise InputFileError if there is no complete and dated record."""
     names = tuple(str(Path(path)) for path in paths)
     parts = [piece.ephemerides for name in names for piece in scan_pieces(name, date=date)]
     whole = merge_records(parts)

@@ -20,7 +20,7 @@ from railfix.io.receiver import nav_messages
 from railfix.io.receiver.nav_messages import Values
 from railfix.io.rinex.navigation_records import RawRecord, list_fields
 
-#: RINEX loss-of-lock bits: lock lost since the previous epoch, and half-cycle ambiguity possible.
+#: RINEX loss-of-lock bits: bit 0 for a cycle slip since the previous epoch, bit 1 for a half-cycle ambiguity.
 _SLIP, _HALF_CYCLE = 1, 2
 
 
@@ -30,23 +30,23 @@ class Measurements:
 
     time: Datetimes  #: Time tags in the order of the stream, shape (T,).
     epoch: Indices  #: Epoch of each measurement, shape (N,).
-    #: Satellite and signal of each measurement, shape (N,); blank where RINEX has no name. Measurements without a name
+    #: Satellite and signal of each measurement, shape (N,). They are blank where RINEX has no name; such measurements
     #: are counted but not used.
     satellite: Strings
     signal: Strings
-    #: Measured values, shape (N,); NaN where a value is absent or declared invalid by the receiver.
+    #: Measured values, shape (N,); NaN where the receiver sent no value or declared it invalid.
     code_m: Floats
     phase_cycles: Floats
     doppler_hz: Floats
     cn0_dbhz: Floats
-    lock_s: Floats  #: Minimum time of continuous phase tracking, shape (N,).
+    lock_s: Floats  #: Lock time: least time of continuous phase tracking, shape (N,).
     half_cycle: Masks  #: Whether a half-cycle ambiguity of the phase is unresolved, shape (N,).
-    polarity: Integers  #: Number whose change indicates a half-cycle jump of the phase, shape (N,).
-    glonass_channel: Integers  #: Frequency channel of GLONASS, unknown if not in -7 to 6; shape (N,).
+    polarity: Integers  #: Phase polarity, shape (N,); a change is a half-cycle jump of the phase.
+    glonass_channel: Integers  #: GLONASS frequency channel, shape (N,); unknown if outside -7 to 6.
     leap_seconds: int | None = None
     receiver: str = ""
     skipped: Mapping[str, int] = field(default_factory=dict)
-    #: Indicators at each epoch (`Observations.receiver_alarm`, `Observations.front_end_gain`); shape (T,).
+    #: Interference indicators at each epoch, shape (T,); see `Observations.receiver_alarm` and `front_end_gain`.
     alarm: Bytes | None = None
     gain: Floats | None = None
 
@@ -56,7 +56,7 @@ class Tracking:
     """State of phase tracking after a piece of a log."""
 
     last: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Time of the last epoch.
-    #: Lock time [s] and polarity of the last phase of each channel, by channel name.
+    #: Lock time [s] and polarity of the last phase measurement, by channel name ("G051C").
     lock: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
@@ -112,7 +112,7 @@ def join_observations(measurements: Measurements, tracking: Tracking | None = No
 
 
 def _at_epochs(values: NDArray[Any] | None, rising: Masks, absent: float) -> NDArray[Any]:
-    """Return the values of the accepted epochs, `absent` for all epochs of a log without such values."""
+    """Return the values at the accepted epochs; if `values` is None, `absent` at every epoch."""
     kind = np.float64 if np.isnan(absent) else np.uint8
     return np.full(int(rising.sum()), absent, dtype=kind) if values is None else values[rising]
 
@@ -141,7 +141,7 @@ def slips(lock_s: Floats, polarity: Floats) -> Masks:
 
     A phase is discontinuous if the lock time is 0 or has decreased, or if the polarity has changed.
 
-    Inputs are NaN where there is no phase.
+    Lock time and polarity are NaN where there is no phase.
     """
     present = ~np.isnan(lock_s)
     epochs = np.where(present, np.arange(len(lock_s))[:, None], -1)
@@ -177,7 +177,7 @@ def no_measurements(receiver: str) -> Measurements:
 
 
 def join_measurements(parts: Sequence[Measurements]) -> Measurements:
-    """Join the measurements of several pieces of a log; equal time tags in different pieces remain separate epochs."""
+    """Join the measurements of several pieces of a log. Equal time tags in different pieces remain separate epochs."""
     shift = np.cumsum([0, *(len(part.time) for part in parts[:-1])])
     epoch = np.concatenate([part.epoch + k for part, k in zip(parts, shift.tolist(), strict=True)])
     leap = [part.leap_seconds for part in parts if part.leap_seconds is not None]
@@ -190,18 +190,18 @@ def join_measurements(parts: Sequence[Measurements]) -> Measurements:
     )
 
 
-#: Record, and the issue of data that distinguishes the record from the next record of the satellite.
+#: Navigation record, and its issue: the values by which it is distinguished from other records of the satellite.
 Record = tuple[RawRecord, tuple[float, ...]]
 
 _GALILEO_WEEK_MINUS_GPS: Final = 1024
 _BDS_WEEK_MINUS_GPS: Final = 1356
-#: Bit of the Galileo data source, set if the clock refers to E5a and E1.
+#: Bit of the Galileo data-source word that is set if the clock refers to E5a and E1.
 _E5A_CLOCK: Final = 1 << 8
 _MOSCOW_S: Final = 3 * 3600.0
 
 
 def gps_record(satellite: str, values: Values, time: np.datetime64) -> Record:
-    """Return the record of GPS or QZSS (LNAV 1 to 3, RTCM 1019, 1044); `time` (of reception) resolves the week."""
+    """Return the GPS or QZSS record (LNAV 1 to 3, RTCM 1019, 1044). The time of reception `time` resolves the week."""
     week, epoch = _week_and_toc(values, _near_week(values["week"], time), time)
     numbers = {
         **values,
@@ -216,7 +216,7 @@ def gps_record(satellite: str, values: Values, time: np.datetime64) -> Record:
 
 
 def cnav_record(satellite: str, values: Values) -> Record:
-    """Return the record of GPS or QZSS from the fields of CNAV messages 10, 11 and 30, whose week is unambiguous."""
+    """Return the GPS or QZSS record from the fields of CNAV messages 10, 11 and 30, which have the full week."""
     sent = from_week(int(values["week"]), values["tow_s"])
     toc = nearest_week(values["toc_s"], sent)
     delays = ("group_delay_1_s", *(f"inter_signal_{k}" for k in range(4)))
@@ -232,7 +232,7 @@ def cnav_record(satellite: str, values: Values) -> Record:
 
 
 def bcnav_record(satellite: str, message: str, values: Values) -> Record | None:
-    """Return the record of BeiDou from the fields of B-CNAV1 or B-CNAV2, whose week is unambiguous.
+    """Return the BeiDou record from the fields of B-CNAV1 or B-CNAV2, which have the full week.
 
     Return None if the fields are of another satellite or an unknown kind of orbit.
     """
@@ -269,7 +269,7 @@ def galileo_record(satellite: str, values: Values, time: np.datetime64) -> Recor
 
 
 def beidou_record(satellite: str, message: str, values: Values, time: np.datetime64) -> Record | None:
-    """Return the BeiDou record from the fields of D1, D2 or RTCM 1042; None if the fields are of two issues."""
+    """Return the BeiDou record from the fields of D1, D2 or RTCM 1042, or None for fields of different issues."""
     if values["toc_s"] != values["toe_sow_s"]:  # one issue has one reference time (ICD, 5.2.4.9)
         return None
     week, epoch = _week_and_toc(values, int(values["week"]) + _BDS_WEEK_MINUS_GPS, time)
@@ -286,7 +286,7 @@ def beidou_record(satellite: str, message: str, values: Values, time: np.datetim
 
 
 def glonass_record(satellite: str, values: Values, time: np.datetime64) -> Record:
-    """Return the GLONASS record from the fields of strings 1 to 4, or of RTCM 1020; `time` resolves the day."""
+    """Return the GLONASS record from the fields of strings 1 to 4 or RTCM 1020. The reception time resolves the day."""
     epoch = nearest_day(values["tb_s"] - _MOSCOW_S, gpst_to_utc(time))
     _, message_time = to_week(nearest_day(_frame_s(values), gpst_to_utc(time)))
     numbers = {
@@ -301,7 +301,7 @@ def glonass_record(satellite: str, values: Values, time: np.datetime64) -> Recor
 
 
 def frame_time(values: Values, time: np.datetime64) -> Datetimes:
-    """Return the start, in GPS time, of the GLONASS frame that contains a string 1; `time` resolves the day."""
+    """Return the GPS time of the GLONASS frame start in string 1. The time of reception `time` resolves the day."""
     utc = gpst_to_utc(time)
     return np.asarray(time + (nearest_day(_frame_s(values), utc) - utc))
 
@@ -313,8 +313,8 @@ def _frame_s(values: Values) -> float:
 def _week_and_toc(values: Values, week: int, time: np.datetime64) -> tuple[int, Datetimes]:
     """Return the GPS week of toe, and toc as GPS time.
 
-    The broadcast week is the week of transmission; near the end of a week, toe may be in the next week. RTCM 3 has no
-    time of transmission, so the time of reception `time` is used instead.
+    The broadcast week is the week of transmission, but near the end of a week, toe may be in the next week. RTCM 3 has
+    no time of transmission; the time of reception `time` is used instead.
     """
     sent_s = values.get("tow_s", values["toe_sow_s"] if np.isnat(time) else float(to_week(time)[1]))
     sent = from_week(week, sent_s)
@@ -335,6 +335,6 @@ def _raw(satellite: str, message: str, epoch: Datetimes | np.datetime64, numbers
 
 
 def _near_week(broadcast: float, time: np.datetime64) -> int:
-    """Return the full week nearest to a time from a week number of ten bits."""
+    """Return the full week number that is nearest to `time` and has the ten broadcast bits."""
     week = int(to_week(time)[0])
     return week + (int(broadcast) - week + 512) % 1024 - 512

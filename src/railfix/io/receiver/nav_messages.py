@@ -1,7 +1,7 @@
 """Decode navigation messages: GPS and QZSS LNAV and CNAV, Galileo I/NAV and F/NAV, BeiDou D1, D2, B-CNAV1 and
 B-CNAV2, and GLONASS.
 
-The bits of many messages of one kind are converted to arrays of scaled fields. Angles are in radians.
+All messages of one kind are converted together, from bits to arrays of scaled fields. Angles are in radians.
 
 Sources: IS-GPS-200N, 20.3.3 and 30.3.3; IS-QZSS-PNT-005, 4.1.2 and 4.3.2; Galileo OS SIS ICD 2.1, 4.2.3 and 4.3.5;
 BDS-SIS-ICD-B1I 3.0, 5.2 and 5.3; BDS-SIS-ICD-B1C 1.0, 6.2 and B2a 1.0, 6.2 and 7 (as read by cssrlib 1.2.1); GLONASS
@@ -21,18 +21,18 @@ from railfix.core.checksums import crc24q
 from railfix.io.receiver.framing import BCNAV1_PAGE, Field, Subframes, fields, read_unsigned, unpack_words
 
 _PI: Final = np.pi
-Coding = tuple[int, float, str]  #: Number of bits, factor and coding of a field (as in `Field`).
+Coding = tuple[int, float, str]  #: Number of bits, scale factor and coding of a field, as in `Field`.
 Values = Mapping[str, float]  #: Fields of a message by name.
 Place = int | tuple[tuple[int, int], ...]
 
 
 def layout(codings: Mapping[str, Coding], **places: Place) -> dict[str, Field]:
-    """Return the layout of a message, given the coding, and the first bit or the pieces, of each field."""
+    """Return the layout of a message. `places` has the first bit of each field, or the pieces of a divided field."""
     return {name: (place, *codings[name]) for name, place in places.items()}
 
 
 def _with_head(head: dict[str, Field], kinds: dict[int, dict[str, Field]]) -> dict[int, dict[str, Field]]:
-    """Return layouts by kind of message, each extended by the fields `head`, which all kinds of message have."""
+    """Return layouts by kind of message, with the fields `head`, which all kinds have, added to each layout."""
     return {kind: head | fields for kind, fields in kinds.items()}
 
 
@@ -42,7 +42,7 @@ def _flags(**lengths: int) -> dict[str, Coding]:
 
 
 def _klobuchar(first: int) -> dict[str, Field]:
-    """Return the layout of the eight ionospheric parameters of GPS, of eight bits each, the first at bit `first`."""
+    """Return the layout of the eight Klobuchar parameters, which have eight bits each and begin at bit `first`."""
     factors = (2.0**-30, 2.0**-27, 2.0**-24, 2.0**-24, 2.0**11, 2.0**14, 2.0**16, 2.0**16)
     return {f"ion{k}": (first + 8 * k, 8, factor, "s") for k, factor in enumerate(factors)}
 
@@ -74,7 +74,7 @@ LNAV_CODINGS: Final[dict[str, Coding]] = {
     "af0_s": (22, 2.0**-31, "s"),
     "leap_seconds": (8, 1.0, "s"),
 }
-#: LNAV subframes without parity (10 words of 24 bits); all have the TOW count and the subframe number.
+#: Fields that all LNAV subframes have. Subframes are decoded without parity, as 10 words of 24 bits.
 LNAV_HEAD: Final = layout(LNAV_CODINGS, tow_s=24, subframe=43)
 LNAV: Final = _with_head(LNAV_HEAD, {
     1: layout(LNAV_CODINGS, week=48, accuracy=60, health=64, iodc=((70, 2), (168, 8)), group_delay_1_s=160, toc_s=176,
@@ -137,7 +137,7 @@ _CNAV_CODINGS: Final[dict[str, Coding]] = {
     "af2": (10, 2.0**-60, "s"),
     **dict.fromkeys(("group_delay_1_s", *(f"inter_signal_{k}" for k in range(4))), (13, 2.0**-35, "s")),
 }
-#: CNAV messages of 300 bits; all have PRN, message type and TOW count.
+#: Fields that all CNAV messages (300 bits) have.
 CNAV_HEAD: Final = layout(_CNAV_CODINGS, number=8, type=14, tow_s=20)
 CNAV: Final = _with_head(CNAV_HEAD, {
     10: layout(_CNAV_CODINGS, week=38, health=51, top=54, accuracy_index=65, toe_sow_s=70, delta_a=81, a_dot=107,
@@ -149,9 +149,9 @@ CNAV: Final = _with_head(CNAV_HEAD, {
     | _klobuchar(192),
 })  # fmt: skip
 CNAV_NO_DELAY_S: Final = -4096 * 2.0**-35  #: Value of an unavailable CNAV group delay (IS-GPS-200N, 30.3.3.3.1.1).
-#: Reference semi-major axis of CNAV [m] by constellation letter (IS-GPS-200N, table 30-I; IS-QZSS-PNT-005).
+#: CNAV reference semi-major axis [m] by constellation letter (IS-GPS-200N, table 30-I; IS-QZSS-PNT-005).
 CNAV_AXIS_M: Final = {"G": 26_559_710.0, "J": 42_164_200.0}
-#: Reference rate of right ascension of CNAV [rad/s] (IS-GPS-200N, table 30-I; IS-QZSS-PNT-005).
+#: CNAV reference rate of right ascension [rad/s] (IS-GPS-200N, table 30-I; IS-QZSS-PNT-005).
 CNAV_OMEGA_DOT: Final = -2.6e-9 * _PI
 _BCNAV2_CODINGS: Final[dict[str, Coding]] = {
     **_CNAV_ORBIT,
@@ -162,7 +162,7 @@ _BCNAV2_CODINGS: Final[dict[str, Coding]] = {
     "af2": (11, 2.0**-66, "s"),
     **dict.fromkeys(("group_delay_1_s", "group_delay_2_s", "inter_signal_1"), (12, 2.0**-34, "s")),
 }
-#: BeiDou B-CNAV2 messages of 288 bits, without preamble and parity symbols; all have PRN, type and SOW.
+#: Fields that all B-CNAV2 messages (288 bits, without preamble and parity symbols) have.
 BCNAV2_HEAD: Final = layout(_BCNAV2_CODINGS, number=0, tow_s=12)
 BCNAV2: Final = _with_head(BCNAV2_HEAD, {
     10: layout(_BCNAV2_CODINGS, week=30, iode=53, toe_sow_s=61, kind=72, delta_a=74, a_dot=100, delta_n=125,
@@ -178,9 +178,9 @@ _BCNAV1_CODINGS: Final[dict[str, Coding]] = {
     "tow_s": (16, 18.0, "u"),
     "inter_signal_0": (12, 2.0**-34, "s"),
 }
-BCNAV1_WITH_HEALTH: Final = (1, 2, 3, 4)  #: Page types of subframe 3 that begin with the health status.
-#: Subframe, first bit and end of the data bits in each of the three pages into which a B-CNAV1 frame is divided. In a
-#: page, these bits follow PRN, page number and SOW.
+BCNAV1_WITH_HEALTH: Final = (1, 2, 3, 4)  #: Subframe 3 page types that begin with the health status.
+#: Data bits of the three pages into which railfix divides a B-CNAV1 frame: subframe, first bit and end. In a page, the
+#: data bits follow PRN, page number and SOW.
 BCNAV1_PARTS: Final = ((2, 0, 275), (2, 275, 569), (3, 0, 15))
 BCNAV1_HEAD: Final = layout(_BCNAV1_CODINGS, number=0, tow_s=8)
 BCNAV1: Final = _with_head(BCNAV1_HEAD, {
@@ -190,10 +190,9 @@ BCNAV1: Final = _with_head(BCNAV1_HEAD, {
               toc_s=213, af0_s=224, af1=249, af2=271, group_delay_2_s=282, inter_signal_0=294, group_delay_1_s=306),
     2: layout(_BCNAV1_CODINGS, page=24, health=30, flags=32, sismai=35),
 })  # fmt: skip
-#: Reference semi-major axes of B-CNAV1 and B-CNAV2 [m] by kind of orbit: geosynchronous (1, 2) and medium Earth orbits
-#: (3).
+#: B-CNAV1 and B-CNAV2 reference semi-major axis [m] by orbit type: 1 GEO, 2 IGSO, 3 MEO.
 BCNAV_AXIS_M: Final = {1: 42_162_200.0, 2: 42_162_200.0, 3: 27_906_100.0}
-CNAV_CHECKED, FNAV_CHECKED, BCNAV2_CHECKED = 276, 214, 264  #: Number of bits before the CRC: CNAV, F/NAV, B-CNAV2.
+CNAV_CHECKED, FNAV_CHECKED, BCNAV2_CHECKED = 276, 214, 264  #: Number of bits before the CRC.
 BEIDOU_CODINGS: Final[dict[str, Coding]] = {
     **_ORBIT,
     **_flags(number=6, tow_s=20, subframe=3, health=1, aodc=5, aode=5, accuracy=4, week=13, toe_high=2, toe_low=15),
@@ -206,7 +205,7 @@ BEIDOU_CODINGS: Final[dict[str, Coding]] = {
     **dict.fromkeys(("cuc", "cus", "cic", "cis"), (18, 2.0**-31, "s")),
     **dict.fromkeys(("crc", "crs"), (18, 2.0**-6, "s")),
 }
-#: Fields of all BeiDou D1 and D2 subframes (10 words of 30 bits, parity included): seconds of week, subframe number.
+#: Fields that all BeiDou D1 and D2 subframes have (10 words of 30 bits, parity included).
 BDS_HEAD: Final = layout(BEIDOU_CODINGS, tow_s=((18, 8), (30, 12)), subframe=15)
 D1: Final = _with_head(BDS_HEAD, {
     1: layout(BEIDOU_CODINGS, health=42, aodc=43, accuracy=48, week=60, toc_s=((73, 9), (90, 8)), group_delay_1_s=98,
@@ -220,7 +219,7 @@ D1: Final = _with_head(BDS_HEAD, {
               omega_dot=((131, 11), (150, 13)), cis=((163, 9), (180, 9)), i_dot=((189, 13), (210, 1)),
               omega0=((211, 21), (240, 11)), omega=((251, 11), (270, 21))),
 })  # fmt: skip
-#: First bit of each page of D2 subframe 1 in the 3000 bits of ten consecutive pages. Fields that extend over two pages
+#: First bit of each page of D2 subframe 1, if its ten pages are joined to 3000 bits. Fields that extend over two pages
 #: are defined in pieces.
 _PAGE: Final = {k: 300 * (k - 1) for k in range(1, 11)}
 D2: Final = layout(
@@ -266,22 +265,21 @@ GLONASS_CODINGS: Final[dict[str, Coding]] = {
     "tau_s": (22, 2.0**-30, "m"),
     "dtau": (5, 2.0**-30, "m"),
 }
-#: Layouts of the GLONASS strings by string number. Each string has 85 bits, beginning with the idle bit.
+#: Layouts of the GLONASS strings by string number. Each string has 85 bits; the first is the idle bit.
 GLONASS: Final = {
     1: layout(GLONASS_CODINGS, hour=9, minute=14, half_minute=20, x_velocity=21, x_acceleration=45, x=50),
     2: layout(GLONASS_CODINGS, health=5, tb_s=9, y_velocity=21, y_acceleration=45, y=50),
     3: layout(GLONASS_CODINGS, relative_frequency=6, ln=20, z_velocity=21, z_acceleration=45, z=50),
     4: layout(GLONASS_CODINGS, tau_s=5, age=32, day=59, slot=70),
 }
-#: User range accuracy of GPS, QZSS and BeiDou [m] by index, the nominal values that RINEX writes
-#: (IS-GPS-200N, 20.3.3.3.1.3).
+#: Nominal user range accuracy [m] by URA index (GPS, QZSS, BeiDou), as in RINEX (IS-GPS-200N, 20.3.3.3.1.3).
 URA_NOMINAL_M: Final = np.array([2, 2.8, 4, 5.7, 8, 11.3, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096, 8192])
 
 
 def inav_words(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]) -> tuple[Bytes, Masks]:
-    """Return I/NAV words as bits (N, 128) from page pairs (N, 8), even page first, and whether each pair is valid.
+    """Return the bits of I/NAV words, shape (N, 128), and whether each page pair is valid, shape (N,).
 
-    A pair is valid if its CRC is correct and neither page is an alert page.
+    Rows of `words` are page pairs, even page first. A pair is valid if its CRC is correct and no page is an alert page.
     """
     bits = unpack_words(words[:, :8], drop=0, keep=32)
     even, odd = bits[:, :120], bits[:, 128:248]
@@ -291,7 +289,7 @@ def inav_words(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]) -> tuple
 
 
 def has_crc(bits: Bytes, checked: int) -> Masks:
-    """Return a mask of the messages whose first `checked` bits are followed by their CRC-24Q, shape (N,)."""
+    """Return whether the first `checked` bits of each message are followed by their CRC-24Q, shape (N,)."""
     before = np.zeros((len(bits), -checked % 8), dtype=np.uint8)
     data = np.packbits(np.concatenate([before, bits[:, :checked]], axis=1), axis=1)
     start = np.arange(len(data)) * data.shape[1]
@@ -300,15 +298,15 @@ def has_crc(bits: Bytes, checked: int) -> Masks:
 
 
 def sisa_m(index: Floats) -> Floats:
-    """Return Galileo signal-in-space accuracy [m] by index; NaN where no prediction is available (ICD, table 89)."""
+    """Return the Galileo signal-in-space accuracy [m] by index (ICD, table 89); NaN if no prediction is available."""
     return np.asarray(np.interp(index, (0, 50, 75, 100, 125), (0.0, 0.5, 1.0, 2.0, 6.0), right=np.nan))
 
 
 def glonass_hamming(bits: Bytes) -> Masks:
     """Return whether GLONASS strings of 85 bits pass their Hamming code (ICD, 4.7), shape (N,)."""
-    # Bit 85 of the ICD is sent first. The data bits, 9 to 85 in the ICD, have the positions of a Hamming code that are
-    # not powers of two, in this order; check bit k covers the positions with bit k set. Check bits are the ICD's bits 1
-    # to 7.
+    # The ICD numbers the bits from 85, which is sent first, to 1. Its bits 9 to 85 are data bits, at the positions of a
+    # Hamming code that are not powers of two. Its bits 1 to 7 are check bits; check bit k covers the positions with bit
+    # k set.
     value = bits[:, 84::-1].astype(np.int64)
     places = np.array([place for place in range(1, 86) if place & (place - 1)])[:77]
     checks = [(value[:, 8:][:, places >> k & 1 == 1].sum(axis=1) + value[:, k]) & 1 for k in range(7)]
@@ -317,24 +315,24 @@ def glonass_hamming(bits: Bytes) -> Masks:
     return np.asarray(~wrong & (total == 0))
 
 
-#: Galileo data sources of I/NAV (clock and group delay of E5b/E1): received on E1-B, and received on E5b-I.
+#: Galileo data-source words for I/NAV on E1-B and on E5b-I; its clock and group delay refer to E5b and E1.
 E1B_SOURCE, E5B_SOURCE = 1 << 0 | 1 << 9, 1 << 2 | 1 << 9
-#: Galileo data source of F/NAV (clock and group delay of E5a/E1).
+#: Galileo data-source word for F/NAV; its clock and group delay refer to E5a and E1.
 E5A_SOURCE: Final = 1 << 1 | 1 << 8
 _UBX_E5B: Final = (5, 6)
 _UBX_E5A: Final = (3, 4)
-_CNAV_SIGNALS: Final = {"G": (3, 4, 6, 7), "J": (4, 5, 8, 9)}  #: UBX numbers of signals with CNAV (L2C, L5).
+_CNAV_SIGNALS: Final = {"G": (3, 4, 6, 7), "J": (4, 5, 8, 9)}  #: UBX numbers of the L2C and L5 signals.
 #: UBX numbers of BeiDou signals with D1 or D2, with B-CNAV1 (B1C) and with B-CNAV2 (B2a).
 _D_SIGNALS, _B1C, _B2A = (0, 1, 2, 3, 4, 10), (5, 6), (7, 8)
-#: Offsets added to the numbers of F/NAV pages, CNAV messages and B-CNAV1 pages, so that the page numbers of a satellite
-#: are unique.
+#: Offsets added to the numbers of F/NAV pages, CNAV and B-CNAV2 messages, and B-CNAV1 pages, so that the page numbers
+#: of a satellite are unique.
 FNAV_FROM, CNAV_FROM, BCNAV1_FROM = 200, 300, 400
 _PREAMBLE: Final = 0x8B
 Pages = Iterator[tuple[int, int, Values]]  #: Row in `Subframes`, page number and fields of each page.
 
 
 def decode_pages(subframes: Subframes) -> tuple[list[tuple[int, str, int, Values]], Counter[str]]:
-    """Return the decoded pages in the order of the stream (row, satellite, number, fields), and the numbers of skipped
+    """Return the decoded pages (row, satellite, page number, fields) in the order of the stream, and counts of skipped
     pages.
     """
     counts = Counter(subframes.skipped)
@@ -352,7 +350,7 @@ def decode_pages(subframes: Subframes) -> tuple[list[tuple[int, str, int, Values
 def _of_kinds(
     bits: Bytes, valid: Masks, kind: Integers, layouts: Mapping[int, Mapping[str, Field]], first: int = 0
 ) -> Pages:
-    """Yield row, number (`first` plus the kind) and fields of the valid pages of each kind."""
+    """Yield the row, the page number (`first` plus the kind) and the fields of each valid page."""
     for k, layout in layouts.items():
         rows = np.flatnonzero(valid & (kind == k))
         table = fields(bits[rows], layout)
@@ -363,7 +361,7 @@ def _of_kinds(
 def _with_crc(
     part: Subframes, here: Masks, checked: int, counts: Counter[str], fault: str, preamble: int | None = None
 ) -> tuple[Bytes, Masks]:
-    """Return the bits of pages, and which pages of `here` have a valid preamble and CRC; count invalid pages."""
+    """Return the bits of all pages, and whether each page is in `here` and valid. Count the invalid pages in `here`."""
     bits = unpack_words(part.words, drop=0, keep=32)
     if not here.any():
         return bits, here
@@ -419,7 +417,7 @@ def _beidou(part: Subframes, counts: Counter[str]) -> Pages:
     heads = dict.fromkeys(range(1, 11), BDS_HEAD)
     for row, k, head in _of_kinds(bits, valid & geo & (subframe == 1), read_unsigned(bits, 42, 4), heads, 100):
         packed = int("".join(map(str, bits[row].tolist())), 2)
-        yield row, k, {**head, "page": packed}  # the whole page, because fields extend over the ends of pages
+        yield row, k, {**head, "page": packed}  # all bits, because fields extend over several pages
 
 
 def _glonass(part: Subframes, counts: Counter[str]) -> Pages:

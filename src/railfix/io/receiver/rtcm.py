@@ -24,7 +24,7 @@ from railfix.io.receiver.nav_messages import Coding, layout
 
 #: Constellation letter by the first three digits of an MSM number.
 SYSTEMS: Final = {107: "G", 108: "R", 109: "E", 110: "S", 111: "J", 112: "C"}
-#: RINEX signal by constellation and number in the signal mask.
+#: RINEX signal by constellation and number in the MSM signal mask.
 SIGNALS: Final[Mapping[str, Mapping[int, str]]] = {
     "G": dict(zip((2, 3, 4, 8, 9, 10, 15, 16, 17, 22, 23, 24, 30, 31, 32),
                   "1C 1P 1W 2C 2P 2W 2S 2L 2X 5I 5Q 5X 1S 1L 1X".split(), strict=True)),
@@ -39,8 +39,8 @@ SIGNALS: Final[Mapping[str, Mapping[int, str]]] = {
 }  # fmt: skip
 _MS: Final = SPEED_OF_LIGHT * 1e-3
 _HEADER_BITS: Final = 169
-#: Layout by MSM type: bits and resolution [ms] of the fine code and of the fine phase, bits of lock time and of C/N0,
-#: resolution of C/N0 [dB-Hz], and whether the message has range rates.
+#: Layout by MSM type: fine code (bits, resolution [ms]), fine phase (bits, resolution [ms]), lock time (bits), C/N0
+#: (bits, resolution [dB-Hz]), and whether the message has range rates.
 _LAYOUT: Final = {
     4: (15, 2.0**-24, 22, 2.0**-29, 4, 6, 1.0, False),
     5: (15, 2.0**-24, 22, 2.0**-29, 4, 6, 1.0, True),
@@ -51,13 +51,13 @@ MSM_NUMBERS: Final = tuple(tens * 10 + kind for tens in SYSTEMS for kind in _LAY
 #: Name under which messages whose week cannot be resolved are counted.
 UNDATED: Final = "RTCM 3 observations without a date"
 IN_GPS_TIME: Final = "BeiDou messages in GPS time, read as such"
-_BEIDOU_LATE_S: Final = 14  #: GPS time minus BeiDou time [s].
+_BEIDOU_LATE_S: Final = 14  #: GPS time minus BeiDou time [s]; error of BeiDou times sent in GPS time.
 _MOSCOW_S: Final = 10_800.0
 _GLONASS_RANGE: Final = range(-7, 7)
 
 
 def _lock_table(bits: int) -> Floats:
-    """Return the minimum lock time [s] by indicator: DF402 (4 bits), DF407 (10 bits)."""
+    """Return the minimum lock time [s] by lock time indicator, DF402 (4 bits) or DF407 (10 bits)."""
     if bits == 4:
         return np.array([0.0] + [2.0 ** (k + 4) for k in range(1, 16)]) * 1e-3
     steps = np.concatenate([np.ones(64), np.repeat(2.0 ** np.arange(1, 21), 32)])
@@ -69,7 +69,7 @@ class ChannelNews(NamedTuple):
     """GLONASS frequency channels in order of reception, N rows."""
 
     place: Indices  #: Offset in the stream, shape (N,).
-    number: Integers  #: Number of the satellite, shape (N,).
+    number: Integers  #: Satellite number, shape (N,).
     channel: Integers  #: Frequency channel, shape (N,).
 
     def latest(self) -> dict[int, int]:
@@ -77,7 +77,7 @@ class ChannelNews(NamedTuple):
         return dict(zip(self.number.tolist(), self.channel.tolist(), strict=True))
 
     def at(self, place: Indices, numbers: Integers) -> Integers:
-        """Return channels known at offsets of the stream, shape (offsets, satellites); -99 where unknown."""
+        """Return the channels known at the offsets `place`, shape (offsets, satellites); -99 where unknown."""
         found = np.full((len(place), len(numbers)), -99)
         for k, number in enumerate(numbers.tolist()):
             mine = self.number == number
@@ -87,7 +87,7 @@ class ChannelNews(NamedTuple):
 
 
 def glonass_channels(frames: Frames, before: Mapping[int, int]) -> ChannelNews:
-    """Return the channels known before, then the channels in messages 1020; MSM4 and MSM6 do not contain channels."""
+    """Return the channels in `before` and in messages 1020, because MSM4 and MSM6 do not contain channels."""
     chosen = frames.of("rtcm3", 1020)
     bits = take_bits(frames, chosen, 23)
     known = (np.full(len(before), -1), *np.array([*before.items()], dtype=np.int64).reshape(-1, 2).T)
@@ -98,7 +98,7 @@ def glonass_channels(frames: Frames, before: Mapping[int, int]) -> ChannelNews:
 def msm_measurements(frames: Frames, near: np.datetime64, channels: ChannelNews) -> tuple[Measurements, Integers]:
     """Decode all MSM4 to MSM7 messages; return the measurements and the offset of each epoch in the stream.
 
-    `near` is within half a week of the first message; if `near` is NaT, messages are only counted.
+    `near` must be within half a week of the first message. If `near` is NaT, messages are only counted.
     """
     messages = frames.of("rtcm3", *MSM_NUMBERS)
     parts = [
@@ -112,7 +112,7 @@ def msm_measurements(frames: Frames, near: np.datetime64, channels: ChannelNews)
         return replace(no_measurements("RTCM 3"), skipped=skipped), np.zeros(0, dtype=np.int64)
     order = np.concatenate([order for order, _, _ in parts])
     rows = join_measurements([rows for _, rows, _ in parts])
-    # Messages with the same time form one epoch; epochs stay in the order of the stream.
+    # Consecutive messages with the same time form one epoch; epochs stay in the order of the stream.
     by_stream = np.argsort(order, kind="stable")
     letter = np.concatenate([letters for _, _, letters in parts])[by_stream]
     glonass = letter == "R"
@@ -132,7 +132,7 @@ def msm_measurements(frames: Frames, near: np.datetime64, channels: ChannelNews)
 
 
 def _count_unused(frames: Frames, messages: Indices, used: int) -> dict[str, int]:
-    """Return the number of MSM without satellites, and the number of MSM with inconsistent masks or length."""
+    """Count the MSM that have no satellites, and the other unused MSM (inconsistent masks or length)."""
     if len(messages) == used:
         return {}
     empty = int(np.count_nonzero(~take_bits(frames, messages, 137)[:, 73:137].any(axis=1)))
@@ -141,9 +141,7 @@ def _count_unused(frames: Frames, messages: Indices, used: int) -> dict[str, int
 
 
 def _beidou_time(time: Datetimes, letter: Strings) -> tuple[Datetimes, int]:
-    """Correct BeiDou times that an encoder sent in GPS time (14 s late); return all times and the number of
-    corrections.
-    """
+    """Correct BeiDou times that an encoder sent in GPS time. Return all times and the number of corrections."""
     beidou, others = np.flatnonzero(letter == "C"), np.flatnonzero(np.isin(letter, list("GEJ")))
     if not len(beidou) or not len(others):
         return time, 0
@@ -157,7 +155,7 @@ def _beidou_time(time: Datetimes, letter: Strings) -> tuple[Datetimes, int]:
 
 
 def _in_rising_weeks(time: Datetimes, glonass: Masks) -> Datetimes:
-    """Shift times by whole weeks to within half a week of the preceding time; GLONASS times only if all are GLONASS."""
+    """Shift times by whole weeks to within half a week of the preceding time; skip GLONASS if mixed with others."""
     counted = np.flatnonzero(~glonass) if not glonass.all() else np.arange(len(time))
     week = np.timedelta64(7, "D").astype("timedelta64[ns]")
     moved = time.copy()
@@ -167,7 +165,7 @@ def _in_rising_weeks(time: Datetimes, glonass: Masks) -> Datetimes:
 
 
 def _glonass_days(time: Datetimes, glonass: Masks) -> Datetimes:
-    """Shift GLONASS times by whole days toward the previous message, because some encoders send day 0 (DF416)."""
+    """Shift GLONASS times to the day of other systems, because some encoders always send day 0 (DF416)."""
     others = np.flatnonzero(~glonass)
     if not len(others) or not glonass.any():
         return time
@@ -177,7 +175,7 @@ def _glonass_days(time: Datetimes, glonass: Masks) -> Datetimes:
 
 
 def take_bits(frames: Frames, chosen: Indices, length: int) -> Bytes:
-    """Return the first bits of payloads, 0 beyond the payload, shape (N, `length` rounded up to whole bytes)."""
+    """Return at least the first `length` bits of each payload, in whole bytes; bits beyond the payload are 0."""
     octets = np.arange((length + 7) // 8)
     place = frames.start[chosen][:, None] + octets
     inside = octets < (frames.end - frames.start)[chosen][:, None]
@@ -186,7 +184,7 @@ def take_bits(frames: Frames, chosen: Indices, length: int) -> Bytes:
 
 
 def station_ecef_m(frames: Frames) -> tuple[float, float, float] | None:
-    """Return the antenna reference point of the last message 1005 or 1006, ECEF [m]; None without such a message."""
+    """Return the antenna reference point in the last message 1005 or 1006, ECEF [m], or None without such a message."""
     chosen = frames.of("rtcm3", 1005, 1006)
     if not len(chosen):
         return None
@@ -201,7 +199,7 @@ def completes_epoch(frames: Frames, chosen: Indices) -> Masks:
 
 
 def find_unfinished_epoch(frames: Frames) -> int | None:
-    """Return the offset of the first message of the last epoch if more messages are to follow (DF393), else None."""
+    """Return the offset of the last epoch's first message if the epoch is incomplete (DF393), else None."""
     chosen = frames.of("rtcm3", *MSM_NUMBERS)
     if not len(chosen):
         return None
@@ -219,7 +217,7 @@ def find_unfinished_epoch(frames: Frames) -> int | None:
 def _of_number(
     frames: Frames, number: int, near: np.datetime64, channels: ChannelNews
 ) -> Iterator[tuple[Integers, Measurements]]:
-    """Yield the offsets and measurements of messages of one number, grouped by equal masks."""
+    """Yield offsets and measurements of the messages with one number, for each group with equal masks."""
     chosen = frames.of("rtcm3", number)
     if not len(chosen):
         return
@@ -259,7 +257,7 @@ def _decode(
     near: np.datetime64,
     known: Integers,
 ) -> Measurements:
-    """Decode N messages with equal masks; `known` has the GLONASS channels for messages that do not contain them."""
+    """Decode messages with equal masks. `known` has the GLONASS channels, for messages that do not contain channels."""
     system = SYSTEMS[number // 10]
     code_bits, code_step, phase_bits, phase_step, lock_bits, cn0_bits, cn0_step, with_rate = _LAYOUT[number % 10]
     n_satellites, n_cells = len(satellites), int(mask.sum())
@@ -311,7 +309,7 @@ def _decode(
 
 
 def _times(system: str, bits: Bytes, near: np.datetime64) -> Datetimes:
-    """Return the epoch times of messages in GPS time."""
+    """Return the GPS time of each message's epoch."""
     if system == "R":
         day, of_day = read_unsigned(bits, 24, 3), read_unsigned(bits, 27, 27) * 1e-3
         utc_s = day * 86_400.0 + of_day - _MOSCOW_S
@@ -357,7 +355,7 @@ EPHEMERIDES: Final[dict[int, dict[str, Field]]] = {
 
 
 def ephemeris_fields(frames: Frames) -> Iterator[tuple[int, int, dict[str, float]]]:
-    """Yield the fields of every ephemeris message: offset in the stream, message number, values."""
+    """Yield the offset in the stream, the message number and the fields of every ephemeris message."""
     for number, sent in EPHEMERIDES.items():
         chosen = frames.of("rtcm3", number)
         needed = max(first + length for first, length, _, _ in sent.values() if isinstance(first, int))
@@ -369,7 +367,7 @@ def ephemeris_fields(frames: Frames) -> Iterator[tuple[int, int, dict[str, float
             yield place, number, {name: float(values[k]) for name, values in table.items()}
 
 
-#: Week field by ephemeris message: GPS week in which the field is 0, and number of weeks after which the field repeats.
+#: Week field by ephemeris message: GPS week in which the field is first 0, and weeks after which it is 0 again.
 _WEEKS: Final = {1045: (1024, 4096), 1046: (1024, 4096), 1042: (1356, 8192), 1019: (0, 1024), 1044: (0, 1024)}
 
 
@@ -380,9 +378,9 @@ _FIRST_MSM_WEEK: Final = 1642
 def ephemeris_date(frames: Frames, near: np.datetime64 | None) -> np.datetime64:
     """Return the median time of a log's ephemerides, which resolves the week of observations; NaT without ephemerides.
 
-    Galileo is used if available, then BeiDou, whose weeks are unambiguous, then GPS and QZSS. The GPS week, modulo
-    1024, is resolved to the week nearest to `near`; without `near`, to a week from July 2011, when MSM were introduced,
-    to February 2031. The computer's clock is not used.
+    Only Galileo ephemerides are used if there are any, else BeiDou, whose weeks are also unambiguous, else GPS and
+    QZSS. GPS and QZSS send the week modulo 1024. It is resolved to the week nearest to `near`, or without `near`, to a
+    week from July 2011, when MSM were introduced, to February 2031. The computer's clock is not used.
     """
     cycle_begin = _FIRST_MSM_WEEK
     if near is not None:

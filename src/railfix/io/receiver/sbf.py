@@ -2,9 +2,9 @@
 
 Source: mosaic-X5 reference guide 4.14, sections 4.1.9 (satellites), 4.1.10 (signals), 4.2.1 (MeasEpoch), 4.2.2
 (GPSRawCA, GPSRawL2C, GPSRawL5, GALRawFNAV, GALRawINAV, BDSRaw, GLORawCA, QZSRawL1CA, QZSRawL2C, QZSRawL5, GEORawL1,
-GEORawL5, BDSRawB2a), 4.2.8 (PVTGeodetic, PVTCartesian); PolaRx5TR reference guide 5.5.0, page 326 (BDSRawB1C).
-The 1800 symbols of B-CNAV1 are its three subframes of 72, 1200 and 528 symbols. In each code word the data bits precede
-the parity bits; subframe 1 has two code words, of 21 and 51 symbols.
+GEORawL5, BDSRawB2a), 4.2.8 (PVTGeodetic, PVTCartesian); PolaRx5TR reference guide 5.5.0, page 326 (BDSRawB1C). A
+B-CNAV1 frame has 1800 symbols: three subframes of 72, 1200 and 528 symbols. Subframe 1 has two code words, of 21 and 51
+symbols. In each code word, the data bits precede the parity bits.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ BDS_RAW_B2A: Final = 4219
 QZS_RAW_L1CA: Final = 4066
 QZS_RAW_L2C: Final = 4067
 QZS_RAW_L5: Final = 4068
-#: Constellation of each block with navigation pages, and UBX signal number by SBF signal number. If None replaces the
-#: signal numbers, the UBX number of all signals is 0.
+#: Constellation of each block with navigation pages, and its UBX signal numbers by SBF signal number. None means that
+#: the UBX signal number is 0 for all SBF signal numbers.
 _PAGES: Final[dict[int, tuple[str, dict[int, int] | None]]] = {
     GPS_RAW_CA: ("G", None),
     QZS_RAW_L1CA: ("J", None),
@@ -68,14 +68,14 @@ _PAGES: Final[dict[int, tuple[str, dict[int, int] | None]]] = {
     GEO_RAW_L1: ("S", None),
     GEO_RAW_L5: ("S", {25: SBAS_L5}),
 }
-_EVEN_BITS, _BDS_BITS = 114, 300  #: Bits of an even Galileo I/NAV page without its tail, and of a BeiDou page.
-#: Constellation and RINEX signal by signal number.
+_EVEN_BITS, _BDS_BITS = 114, 300  #: Number of bits of an even I/NAV page without tail, and of a BeiDou subframe.
+#: Constellation and RINEX signal by SBF signal number.
 SIGNALS: Final = {
     0: "G1C", 1: "G1W", 2: "G2W", 3: "G2L", 4: "G5Q", 5: "G1L", 6: "J1C", 7: "J2L", 8: "R1C", 9: "R1P", 10: "R2P",
     11: "R2C", 12: "R3Q", 13: "C1P", 14: "C5P", 15: "I5A", 17: "E1C", 19: "E6C", 20: "E5Q", 21: "E7Q", 22: "E8Q",
     24: "S1C", 25: "S5I", 26: "J5Q", 28: "C2I", 29: "C7I", 30: "C6I", 32: "J1L", 33: "J1Z", 34: "C7D", 39: "J5P",
 }  # fmt: skip
-#: First and last SVID, constellation, and number that is added to obtain the RINEX number.
+#: Ranges of SVID: first, last, constellation, and the number that is added to obtain the RINEX satellite number.
 _NUMBERS: Final = (
     (1, 37, "G", 0), (38, 61, "R", -37), (63, 68, "R", -38), (71, 106, "E", -70), (120, 140, "S", -100),
     (141, 180, "C", -140), (181, 187, "J", -180), (191, 197, "I", -190), (198, 215, "S", -157), (223, 245, "C", -182),
@@ -110,18 +110,18 @@ _FRAME: Final = np.dtype(
 _PVT: Final = np.dtype(
     [("tow_ms", "<u4"), ("week", "<u2"), ("mode", "u1"), ("error", "u1"), ("place", "<f8", 3), ("undulation", "<f4")]
 )
-#: RTKLIB's quality of each mode of a PVT block. The modes are 1 stand-alone, 2 differential, 3 fixed position, 4 RTK
-#: fixed, 5 RTK float, 6 SBAS, 7 moving base fixed, 8 moving base float, 10 PPP.
+#: RTKLIB quality by PVT block mode. The modes are 1 stand-alone, 2 differential, 3 fixed position, 4 RTK fixed, 5 RTK
+#: float, 6 SBAS, 7 moving base fixed, 8 moving base float, 10 PPP.
 _QUALITY: Final = {1: 5, 2: 4, 3: 1, 4: 1, 5: 2, 6: 3, 7: 1, 8: 2, 10: 6}
 _NO_TIME: Final = 0xFFFFFFFF
 _NO_WEEK: Final = 0xFFFF
 _TIME: Final = np.dtype([("tow_ms", "<u4"), ("week", "<u2")])  #: Time of a block.
 _SCRAMBLED: Final = 0x80  #: Flag of a MeasEpoch with encrypted measurements.
-_WITHOUT_OFFSET: Final = (1, 2)  #: Signals whose C/N0 has no offset of 10 dB-Hz: GPS L1P(Y) and L2P(Y).
+_WITHOUT_OFFSET: Final = (1, 2)  #: GPS L1P(Y) and L2P(Y), whose C/N0 is sent without the offset of 10 dB-Hz.
 
 
 def _names() -> Strings:
-    """Return the names of satellites by SVID, blank where unknown."""
+    """Return the satellite names by SVID, blank where unknown."""
     table = np.full(256, "", dtype="<U3")
     for first, last, letter, shift in _NUMBERS:
         for number in range(first, last + 1):
@@ -138,7 +138,7 @@ _SIGNAL_NAMES: Final = np.array([SIGNALS.get(number, "") for number in range(64)
 def meas_epoch_measurements(frames: Frames) -> Measurements:
     """Return the measurements of the main antenna in all MeasEpoch blocks.
 
-    Blocks that are malformed, scrambled or without time, and measurements of other antennas, are skipped and counted.
+    Skip and count malformed and scrambled blocks, blocks without time, and measurements of other antennas.
     """
     chosen, head = frames.structures("sbf", [MEAS_EPOCH], _HEAD)
     dated = (head["tow_ms"] != _NO_TIME) & (head["week"] != _NO_WEEK) & (head["size1"] >= 20) & (head["size2"] >= 12)
@@ -168,7 +168,7 @@ def meas_epoch_measurements(frames: Frames) -> Measurements:
 
 
 def _sub_blocks(frames: Frames, index: int, head: np.void) -> list[tuple[int, int]] | None:
-    """Return, for each sub-block of a block, its offset and the offset of the type-1 sub-block that contains it.
+    """Return, for each sub-block, its own offset and the offset of the type-1 sub-block that contains it.
 
     Return None if the block is malformed.
     """
@@ -187,7 +187,7 @@ def _sub_blocks(frames: Frames, index: int, head: np.void) -> list[tuple[int, in
 
 
 def _decode(frames: Frames, place: Indices, master: Indices) -> dict[str, Any]:
-    """Decode sub-blocks; type 1 has absolute values, and type 2 has values relative to the sub-block `master`."""
+    """Decode the sub-blocks at `place`. Type 2 values are relative to the type-1 sub-block at offset `master`."""
     own = place == master
     first = gather_structures(frames.data, master, _FIRST)
     other = gather_structures(frames.data, np.where(own, 0, place), _OTHER) if len(frames.data) >= 12 else first
@@ -233,7 +233,7 @@ def _decode(frames: Frames, place: Indices, master: Indices) -> dict[str, Any]:
 
 
 def _signal_number(kind: Integers, info: Integers) -> Integers:
-    """Return the signal number: bits 0 to 4 of Type, or 32 plus bits 3 to 7 of ObsInfo where those of Type are 31."""
+    """Return the signal number: bits 0 to 4 of Type, or, if these bits are 31, 32 plus bits 3 to 7 of ObsInfo."""
     low = np.asarray(kind, dtype=np.int64) & 31
     return np.where(low == 31, np.asarray(info, dtype=np.int64) // 8 + 32, low)
 
@@ -244,7 +244,7 @@ def _read_signed(value: Integers, bits: int) -> Integers:
 
 
 def navigation_subframes(frames: Frames) -> Subframes:
-    """Return the navigation pages that passed the receiver's check, with words as in UBX RXM-SFRBX."""
+    """Return the navigation pages that passed the receiver's check, arranged in words as in UBX RXM-SFRBX."""
     chosen = frames.of("sbf", *_PAGES)
     # The shortest block (GLONASS, three words) has 24 bytes; words that a block lacks are zero.
     chosen = chosen[frames.end[chosen] - frames.start[chosen] >= 24]
@@ -282,7 +282,7 @@ def navigation_subframes(frames: Frames) -> Subframes:
 
 
 def _bcnav1_pages(frames: Frames) -> Subframes:
-    """Return the frames of B-CNAV1 with valid CRCs, each as three pages (`nav_messages.BCNAV1`)."""
+    """Return the B-CNAV1 frames that have valid CRCs, each as three pages (`nav_messages.BCNAV1`)."""
     chosen, rows = frames.structures("sbf", [BDS_RAW_B1C], _FRAME)
     bits = np.unpackbits(rows["words"].astype(">u4").view(np.uint8).reshape(len(rows), 228), axis=1)
     subframe = {2: bits[:, 72:672], 3: bits[:, 1272:1536]}
@@ -313,12 +313,12 @@ def clock_readings(frames: Frames) -> tuple[Integers, Datetimes]:
 
 
 def _align_words(bits: Bytes, length: int) -> Words:
-    """Return ten right-aligned words of `length` bits, shape (N, 10), from bits of shape (..., 10 * length)."""
+    """Divide the bits of each message into ten right-aligned words of `length` bits, shape (N, 10)."""
     return read_unsigned(bits.reshape(-1, length), 0, length).reshape(-1, 10).astype(np.uint32)
 
 
 def _inav_words(words: Words) -> Words:
-    """Split page pairs, joined without the even page's tail, into four words of the even and four of the odd page."""
+    """Divide page pairs into words: four for the even page, which lacks its tail in SBF, and four for the odd page."""
     bits = unpack_words(words, drop=0, keep=32)
     pages = np.zeros((len(words), 320), dtype=np.uint8)
     pages[:, :_EVEN_BITS] = bits[:, :_EVEN_BITS]
@@ -327,7 +327,7 @@ def _inav_words(words: Words) -> Words:
 
 
 def positions(frames: Frames) -> dict[str, np.ndarray]:
-    """Return the receiver's positions (PVTGeodetic blocks, else PVTCartesian blocks) as columns of `PositionLog`."""
+    """Return the positions in PVTGeodetic blocks, or else in PVTCartesian blocks, as columns of `PositionLog`."""
     geodetic = len(frames.of("sbf", PVT_GEODETIC)) > 0
     _, rows = frames.structures("sbf", [PVT_GEODETIC if geodetic else PVT_CARTESIAN], _PVT)
     mode = rows["mode"] & 15

@@ -18,7 +18,7 @@ from railfix.io.receiver.framing import Frames, Subframes, gather_structures
 from railfix.io.receiver.measurements import Measurements
 
 RXM_RAWX: Final = 0x0215
-#: Raw measurements of receivers up to the u-blox 7, which are counted but not read.
+#: Raw measurements of older receivers, up to the u-blox 7. They are counted but not read.
 RXM_RAW: Final = 0x0210
 RXM_SFRBX: Final = 0x0213
 NAV_PVT: Final = 0x0107
@@ -39,11 +39,11 @@ SIGNALS: Final[Mapping[int, Mapping[int, str]]] = {
 _LNAV_PARITY: Final = (0xEC7CD2, 0x763E69, 0xBB1F34, 0x5D8F9A, 0xAEC7CD, 0x2DEA27)
 #: Indices of the parity equations that contain D29 of the previous word.
 _LNAV_WITH_D29: Final = (0, 2, 5)
-#: Last plausible GPS week of a log, in 2079. If a later date were accepted, all following epochs would be out of order.
+#: Last GPS week that is accepted (2079). A wrong later date would put all other epochs out of order.
 _LAST_WEEK: Final = 5200
-#: Codes [m], phases [cycles] and Dopplers [Hz] from this value on are invalid; they exceed the fields of RINEX.
+#: Codes [m], phases [cycles] and Dopplers [Hz] are invalid from this value on, because RINEX fields are too short.
 _LARGEST: Final = 1e10
-#: Measurement in RXM-RAWX.
+#: One measurement in RXM-RAWX.
 _MEASUREMENT: Final = np.dtype(
     [
         ("code", "<f8"), ("phase", "<f8"), ("doppler", "<f4"), ("gnss", "u1"), ("sv", "u1"), ("signal", "u1"),
@@ -52,7 +52,7 @@ _MEASUREMENT: Final = np.dtype(
     ]
 )  # fmt: skip
 _SFRBX_HEADER: Final = np.dtype([*((name, "u1") for name in ("gnss", "sv", "signal", "channel", "count")), ("_", "V3")])
-_WORDS: Final = np.dtype([("words", "<u4", 10)])  #: Words of RXM-SFRBX, of which at most ten are used.
+_WORDS: Final = np.dtype([("words", "<u4", 10)])  #: Words of RXM-SFRBX; at most ten are used.
 _RAWX_HEADER: Final = np.dtype(
     [("tow", "<f8"), ("week", "<u2"), ("leap", "i1"), ("count", "u1"), ("status", "u1"), ("version", "u1"), ("_", "V2")]
 )
@@ -72,12 +72,12 @@ _HPPOSLLH: Final = np.dtype(
     ]
 )  # fmt: skip
 _PHASE_VALID, _HALF_CYCLE_KNOWN, _HALF_CYCLE_REMOVED, _CODE_VALID = 2, 4, 8, 1
-#: Largest standard deviation of a phase that is used, in units of 0.004 cycle (as in RTKLIB 2.4.3).
+#: Largest standard deviation of a usable phase, as in RTKLIB 2.4.3 [0.004 cycle].
 _LARGEST_PHASE_STD: Final = 5
 
 
 def _name_table() -> Strings:
-    """Return the names of satellites by gnssId and svId, blank where unknown; SBAS PRN 120 is S20."""
+    """Return the satellite names by gnssId and svId, blank where unknown. SBAS PRN 120 is S20."""
     table = np.full((256, 256), "", dtype="<U3")
     for system, letter in SYSTEMS.items():
         shift = 100 if letter == "S" else 0
@@ -90,7 +90,7 @@ _NAMES: Final = _name_table()
 
 
 def rawx_measurements(frames: Frames) -> Measurements:
-    """Return the raw measurements of all RXM-RAWX messages; malformed messages are skipped and counted."""
+    """Return the measurements in all RXM-RAWX messages. Malformed messages are skipped and counted."""
     chosen, header = frames.structures("ubx", [RXM_RAWX], _RAWX_HEADER)
     whole = frames.end[chosen] - frames.start[chosen] == 16 + 32 * header["count"].astype(np.int64)
     plausible = whole & (header["week"] > 0) & (header["week"] <= _LAST_WEEK)
@@ -133,7 +133,7 @@ def rawx_measurements(frames: Frames) -> Measurements:
 
 
 def sfrbx_subframes(frames: Frames) -> Subframes:
-    """Return the subframes of all RXM-SFRBX messages; L1 C/A subframes with wrong parity are skipped and counted."""
+    """Return the subframes in all RXM-SFRBX messages. L1 C/A subframes with wrong parity are skipped and counted."""
     chosen, header = frames.structures("ubx", [RXM_SFRBX], _SFRBX_HEADER)
     whole = frames.end[chosen] - frames.start[chosen] == 8 + 4 * header["count"].astype(np.int64)
     chosen, header = chosen[whole], header[whole]
@@ -173,9 +173,9 @@ def has_lnav_parity(words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]) -> 
 
 
 def positions(frames: Frames, near: np.datetime64) -> dict[str, np.ndarray]:
-    """Return the receiver's positions as columns of `PositionLog`; `near` is within half a week of the positions.
+    """Return the receiver's positions as columns of `PositionLog`. `near` must be within half a week of the positions.
 
-    If `near` is NaT, there are no rows.
+    If `near` is NaT, no positions are returned.
     """
     _, pvt = frames.structures("ubx", [NAV_PVT], _PVT)
     fixed = (pvt["flags"] & 1 == 1) & np.isin(pvt["fix"], [2, 3, 4])
@@ -192,7 +192,7 @@ def positions(frames: Frames, near: np.datetime64) -> dict[str, np.ndarray]:
         horizontal, vertical = rows["horizontal"] * 1e-4, rows["vertical"] * 1e-4
         by_tow = dict(zip(pvt["tow_ms"].tolist(), np.where(fixed, quality, -1).tolist(), strict=True))
         quality = np.array([by_tow.get(tow, 5) for tow in rows["tow_ms"].tolist()], dtype=np.int64)
-        kept &= quality > 0  # before its first fix, a receiver sends positions that NAV-PVT marks as invalid
+        kept &= quality > 0  # positions before the first fix are invalid in NAV-PVT
     else:
         rows, kept = pvt, fixed
         latitude, longitude = rows["latitude"] * 1e-7, rows["longitude"] * 1e-7
@@ -200,7 +200,7 @@ def positions(frames: Frames, near: np.datetime64) -> dict[str, np.ndarray]:
         horizontal, vertical = rows["horizontal_mm"] * 1e-3, rows["vertical_mm"] * 1e-3
     if np.isnat(near):
         kept = np.zeros(len(rows), dtype=bool)
-    # u-blox reports one standard deviation for both horizontal directions together.
+    # u-blox reports one horizontal standard deviation, which combines north and east.
     sigma = np.stack([horizontal / np.sqrt(2.0), horizontal / np.sqrt(2.0), vertical], axis=-1)
     time = np.full(len(rows), np.datetime64("NaT", "ns"))
     if kept.any():
@@ -214,7 +214,7 @@ def positions(frames: Frames, near: np.datetime64) -> dict[str, np.ndarray]:
 
 
 def find_date(frames: Frames) -> np.datetime64:
-    """Return the day of the last NAV-PVT with a valid date (UTC, near enough to resolve weeks), NaT if none."""
+    """Return the UTC day of the last NAV-PVT message that has a valid date, or NaT if there is none."""
     days, _, _ = _date(frames)
     return days[-1] if len(days) else np.datetime64("NaT", "ns")
 

@@ -1,4 +1,4 @@
-"""Header of a RINEX observation file, and header records in the middle of a file."""
+"""Header of a RINEX observation file, and header records among the epochs."""
 
 from __future__ import annotations
 
@@ -18,50 +18,50 @@ from railfix.io.file_kind import wrong_kind
 from railfix.io.rinex.observations_epochs import FaultLog
 from railfix.io.rinex.observations_lines import SYSTEMS, SignalColumn, assign_columns
 
-#: Time systems that TIME OF FIRST OBS may name.
+#: Time systems that are valid in TIME OF FIRST OBS.
 TIME_SYSTEMS: Final = ("GPS", "GLO", "GAL", "BDT", "QZS", "IRN", "UTC")
-#: Time system of a file without TIME OF FIRST OBS, by constellation letter of the file.
+#: Default time system of a file, by constellation letter of the file.
 _DEFAULT_TIME: Final = {"G": "GPS", "R": "GLO", "E": "GAL", "C": "BDT", "J": "QZS", "I": "IRN", "S": "GPS", "M": "GPS"}
-ALL: Final = ""  #: Key of the observation types of a RINEX 2 file, which apply to all constellations.
+ALL: Final = ""  #: Key of RINEX 2 observation types, which apply to all constellations.
 #: Longest accepted header [bytes].
 _MAX_HEADER_BYTES: Final = 4 << 20
 VERSION: Final = "RINEX VERSION / TYPE"  #: Label of the first record of a header.
-#: Alternative names of time systems written by some programs.
+#: Names of time systems that some programs write, and the names in RINEX.
 _OTHER_NAMES: Final = {"GPST": "GPS", "BDS": "BDT", "GLONASS": "GLO", "GALILEO": "GAL", "QZSS": "QZS"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class RinexHeader:
-    """Contents of a header that are needed to read the lines after the header."""
+    """Header contents of an observation file."""
 
     version: float
     system: str  #: Constellation letter of the file, "M" when mixed.
     time_system: str = "GPS"
-    #: Declared observation types by constellation letter; RINEX 2 has one entry, `ALL`.
+    #: Declared observation types by constellation letter. RINEX 2 files have a single entry, `ALL`.
     types: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    #: SYS / SCALE FACTOR by constellation and type.
+    #: Scale factor (SYS / SCALE FACTOR) by constellation and observation type.
     scale: Mapping[tuple[str, str], float] = field(default_factory=dict)
     #: Part of the header that becomes `Observations.header`.
     public: ObservationHeader = field(default_factory=ObservationHeader)
 
     @property
     def reading(self) -> tuple[object, ...]:
-        """Return the contents that determine how the lines after the header are read."""
+        """Return the header contents that determine how the epochs are read."""
         return self.version, self.system, self.time_system, self.types, self.scale
 
     def get_types(self, system: str) -> tuple[str, ...] | None:
-        """Return the declared types of a constellation, None if it is not declared."""
+        """Return the declared observation types of a constellation, or None if the header declares none for it."""
         return self.types.get(ALL if self.version < 3.0 else system)
 
     def columns(self, system: str) -> tuple[SignalColumn, ...]:
-        """Return the columns of the satellite lines of a constellation."""
+        """Return the observation columns in a constellation's satellite lines."""
         return assign_columns(self.get_types(system) or (), system=system, version=self.version, scale=self.scale)
 
 
 def read_header_bytes(stream: ByteStream) -> tuple[list[str], bytes]:
-    """Return the header lines of an observation file, and the bytes read after them.
+    """Return the header lines of an observation file, and the bytes that were read beyond the header.
 
-    Raise InputFileError if the file is not a RINEX observation file, or the header does not end.
+    Raise InputFileError if the file is not a RINEX observation file, or if END OF HEADER is missing.
     """
     data = b""
     found = -1
@@ -83,9 +83,9 @@ def read_header_bytes(stream: ByteStream) -> tuple[list[str], bytes]:
 
 
 def parse_header(path: str, lines: Sequence[str], *, log: FaultLog, first_line: int = 1) -> RinexHeader:
-    """Parse the header of an observation file, which begins at `first_line`; raise InputFileError if it cannot be used.
+    """Parse the header `lines` of an observation file; `first_line` is the line number of the first.
 
-    `log` receives notes on records that are not in their columns, and on unreadable records that are skipped.
+    `log` receives notes on misaligned and on skipped records. Raise InputFileError if the header cannot be used.
     """
     version = read_version(path, lines[0])
     system = lines[0][40:41].strip().upper() or ("G" if version < 3.0 else "M")
@@ -102,7 +102,7 @@ def parse_header(path: str, lines: Sequence[str], *, log: FaultLog, first_line: 
 
 
 def read_version(path: FilePath, line: str) -> float:
-    """Return the version of a RINEX file from its first line; raise InputFileError if the version is not supported."""
+    """Return the RINEX version in the first line of a file. Raise InputFileError if the version is not supported."""
     try:
         version = float(line[:9])
     except ValueError as error:
@@ -116,7 +116,7 @@ def read_version(path: FilePath, line: str) -> float:
 def apply_records(
     path: str, header: RinexHeader, lines: Sequence[str], *, first_line: int, log: FaultLog
 ) -> RinexHeader:
-    """Apply header records in the middle of a file (epoch flags 2 to 4), the first at line `first_line`."""
+    """Return the header changed by header records; `first_line` is the line number of the first record."""
     reader = _HeaderRecords(path, header, log)
     for number, line in enumerate(lines, start=first_line):
         reader.read(line, number)
@@ -124,7 +124,7 @@ def apply_records(
 
 
 class _HeaderRecords:
-    """Applies header records to a copy of a header; records that are not in their columns are split at spaces."""
+    """Reader that applies header records to a copy of a header. Records that are not in columns are split at spaces."""
 
     def __init__(self, path: str, header: RinexHeader, log: FaultLog) -> None:
         self._path = path
@@ -141,7 +141,7 @@ class _HeaderRecords:
         self._scaling: tuple[str, float, int] | None = None
 
     def read(self, line: str, number: int) -> None:
-        """Read one header record at a line number."""
+        """Read one header record; `number` is its line number."""
         self._line = number
         label = line[60:80].strip()
         text = f"{line[:60]:<60}"
@@ -155,9 +155,9 @@ class _HeaderRecords:
                 self._changes |= self._by_words(name, label, text)
 
     def _by_words(self, name: str, label: str, text: str) -> dict[str, Any]:
-        """Return the value of a record whose fields are separated by spaces instead of columns.
+        """Return the value of a record, by field name; the fields are separated by spaces instead of columns.
 
-        An unreadable record is an error, or is noted and skipped if broken lines are counted.
+        An unreadable record is an error with ``broken_lines="stop"``, or else is noted and skipped.
         """
         read = _BY_WORDS.get(label)
         try:
@@ -268,7 +268,7 @@ class _HeaderRecords:
         self._scaling = (system, scale, left - len(names))
 
     def time_of_first(self, text: str) -> None:
-        """Read the time system of TIME OF FIRST OBS; the time is taken from the first epoch instead."""
+        """Read the time system in TIME OF FIRST OBS. The time itself is not used."""
         name = text[48:51].strip()
         if name and name not in TIME_SYSTEMS:
             word = text.split()[-1]
@@ -309,7 +309,7 @@ def _three(text: str) -> Floats:
 
 
 def _place(text: str) -> Floats:
-    """Return three coordinates, NaN if all are 0, which means unknown."""
+    """Return three coordinates, or NaN if all are 0, because zeros mean an unknown position."""
     xyz = _three(text)
     return xyz if xyz.any() else np.full(3, np.nan)
 
@@ -319,7 +319,7 @@ def _interval(text: str) -> float:
     return value if value > 0.0 and math.isfinite(value) else math.nan
 
 
-#: For each record with one value: the field of `ObservationHeader`, and the function that reads the value.
+#: Field of `ObservationHeader`, and function that reads its value, for each record that has one value.
 _VALUES: Final[Mapping[str, tuple[str, Callable[[str], Any]]]] = {
     "APPROX POSITION XYZ": ("approximate_ecef_m", _place),
     "ANTENNA: DELTA H/E/N": ("antenna_delta_hen_m", _three),
@@ -332,7 +332,7 @@ _VALUES: Final[Mapping[str, tuple[str, Callable[[str], Any]]]] = {
 }
 
 
-#: Functions that read records of `_VALUES` if the fields are separated by spaces instead of columns.
+#: Functions for records of `_VALUES` in which fields are separated by spaces instead of columns.
 _BY_WORDS: Final[Mapping[str, Callable[[Sequence[str]], Any]]] = {
     "APPROX POSITION XYZ": lambda words: _place("".join(f"{word:>14}" for word in words[:3])),
     "ANTENNA: DELTA H/E/N": lambda words: _three("".join(f"{word:>14}" for word in words[:3])),

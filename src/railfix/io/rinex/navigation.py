@@ -26,17 +26,17 @@ from railfix.io.rinex.navigation_records import (
     number,
 )
 
-#: Constellation letters by the names in IONOSPHERIC CORR (RINEX 3.05, table A5).
+#: Constellation letter by name in IONOSPHERIC CORR (RINEX 3.05, table A5).
 _ION_LETTER: Final = {"GPS": "G", "BDS": "C", "QZS": "J"}
 
 
 @dataclass
 class NavigationContent:
-    """Records and header values of one or several files."""
+    """Records and header values of one or several navigation files."""
 
     broken_lines: BrokenLines
     records: list[RawRecord] = field(default_factory=list)
-    #: Eight Klobuchar coefficients, alpha and beta, by constellation letter.
+    #: Eight Klobuchar coefficients (four alpha, four beta) by constellation letter.
     klobuchar: dict[str, list[float]] = field(default_factory=dict)
     leap_seconds: int | None = None
     skipped: Counter[str] = field(default_factory=Counter)
@@ -44,7 +44,7 @@ class NavigationContent:
     seen: set[tuple[object, ...]] = field(default_factory=set)
 
     def add(self, record: RawRecord) -> None:
-        """Add a record, or count a duplicate; joined files of several receivers contain duplicates."""
+        """Add a record, or count it if it is a duplicate. Files joined from several receivers contain duplicates."""
         key = (record.satellite, record.epoch, record.message, *record.numbers)
         if key in self.seen:
             self.skipped["duplicate"] += 1
@@ -53,7 +53,7 @@ class NavigationContent:
         self.records.append(record)
 
     def reject(self, error: InputFileError) -> None:
-        """Raise the error of a malformed record, or count and note the error."""
+        """Raise the error of a malformed record, or, with ``broken_lines="count"``, count and note it."""
         if self.broken_lines == "stop":
             raise InputFileError(error.path, f"{error.message}; {LENIENT}", line=error.line)
         self.drop("broken", error)
@@ -71,7 +71,7 @@ class NavigationContent:
             stored[part] = [0.0 if np.isnan(v) else v for v in values]
 
     def klobuchar_sets(self) -> dict[str, Floats]:
-        """Return the coefficients by constellation; sets of zeros, which mean not received, are left out and noted."""
+        """Return the coefficients by constellation. All-zero sets were not received; they are omitted and noted."""
         received = {}
         for letter, values in self.klobuchar.items():
             if any(values):
@@ -82,9 +82,9 @@ class NavigationContent:
 
 
 def read_header(path: FilePath, lines: list[str], content: NavigationContent) -> tuple[float, str, int]:
-    """Read a navigation header into `content`; return version, file type letter and index of the first line after it.
+    """Read a navigation header into `content`. Return version, file type letter and index of the line after the header.
 
-    Raise InputFileError if the header has an invalid number or does not end.
+    Raise InputFileError if the header has an invalid number or no END OF HEADER.
     """
     version, kind = _version(path, lines[0] if lines else "")
     for i, line in enumerate(lines):
@@ -119,20 +119,20 @@ def _header_line(line: str, label: str, content: NavigationContent) -> None:
 
 
 #: Minimum and maximum number of lines of a record, including the epoch line, by constellation (RINEX 2.11, tables A4
-#: and A11; 3.05, tables A6 to A16). Since 3.05, GLONASS records have a fifth line of flags, which are not needed.
+#: and A11; 3.05, tables A6 to A16). GLONASS records since 3.05 have a fifth line of flags, which is not used.
 _LINES: Final = {"G": (8, 8), "J": (8, 8), "E": (8, 8), "C": (8, 8), "R": (4, 5)}
-#: Numbers of lines of messages introduced by RINEX 4 (4.02, tables A10, A11, A18 to A20).
+#: Minimum and maximum number of lines of the messages that RINEX 4 introduced (4.02, tables A10, A11, A18 to A20).
 _LINES_4: Final = {"CNAV": (9, 9), "CNV1": (10, 10), "CNV2": (10, 10), "CNV3": (9, 9)}
-#: Message names of RINEX 4 by constellation.
+#: RINEX 4 message names by constellation.
 _MESSAGES: Final = {
     "G": ("LNAV", "CNAV", "CNV2"), "J": ("LNAV", "CNAV", "CNV2"), "E": ("INAV", "FNAV"),
     "C": ("D1", "D2", "CNV1", "CNV2", "CNV3"), "R": ("FDMA",),
 }  # fmt: skip
-#: Constellation of records without a letter, by file type (RINEX 2.11, 2.12; 3.00 also has types by constellation).
+#: Constellation of records without a letter, by file type (RINEX 2.11, 2.12, 3.00).
 _FILE_SYSTEMS: Final = {"N": "G", "G": "R", "H": "S", "E": "E", "L": "E", "J": "J"}
 _SKIPPED: Final = ("S", "I")  #: Constellations whose records are skipped: SBAS, NavIC.
 _WIDTH: Final = 19  #: Width of a number [characters].
-#: ``> EPH G01 LNAV`` (RINEX 4.02, table A7); time offsets (STO) may name a constellation alone: ``> STO E   IFNV``.
+#: Record title (RINEX 4.02, table A7), such as ``> EPH G01 LNAV``. Time offsets (STO) may lack the satellite number.
 _TITLE: Final = re.compile(r"> *([A-Z]{3}) +([A-Z](?:[ \d]\d)?) *(\S*)")
 
 
@@ -140,7 +140,7 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop") -> Navi
     """Read all records of one or several navigation files, plain or compressed.
 
     With "count", a malformed record is counted in `skipped` and described in `notes`. Raise InputFileError if a file is
-    missing, is not a navigation file, or (with "stop") has a malformed record, or if no file has a usable record.
+    missing or no navigation file, no file has a usable record, or (with "stop") a record is malformed.
     """
     files = path_names(paths)
     content = NavigationContent(broken_lines=broken_lines)
@@ -166,8 +166,8 @@ class _Block:
     """Lines of one record."""
 
     line: int  #: Number of the first line in the file, from 1.
-    name: str  #: Name of the satellite as written.
-    message: str  #: Name of the message, empty before RINEX 4.
+    name: str  #: Satellite name as written in the file.
+    message: str  #: Message name, empty before RINEX 4.
     text: list[str]  #: Text of the lines.
     last: bool = False  #: Whether this is the last record of the file, which may be incomplete.
 
@@ -192,7 +192,7 @@ def _read_file(path: FilePath, content: NavigationContent) -> None:
 
 
 def _blocks(path: FilePath, lines: list[str], begin: int, version: float, kind: str) -> Iterator[_Block]:
-    """Yield the records of versions 2 and 3, whose first lines do not begin with blanks."""
+    """Yield the records of a version 2 or 3 file. Only the first line of a record does not begin with blanks."""
     starts = [i for i in range(begin, len(lines)) if lines[i][:3].strip()]
     _reject_stray(path, lines, begin, starts)
     letter = _FILE_SYSTEMS[kind] if version < 3.0 else ""
@@ -209,7 +209,7 @@ def _reject_stray(path: FilePath, lines: list[str], begin: int, starts: list[int
 
 
 def _blocks_4(path: FilePath, lines: list[str], begin: int, content: NavigationContent) -> Iterator[_Block]:
-    """Yield the ephemerides of version 4; ionosphere records are stored in `content`, other records are counted."""
+    """Yield the ephemerides of a version 4 file. Ionosphere records go to `content`; other records are counted."""
     starts = [i for i in range(begin, len(lines)) if lines[i].startswith(">")]
     _reject_stray(path, lines, begin, starts)
     for start, end in zip(starts, [*starts, len(lines)][1:], strict=True):
@@ -233,7 +233,7 @@ def _blocks_4(path: FilePath, lines: list[str], begin: int, content: NavigationC
 def _ionosphere_4(
     path: FilePath, letter: str, message: str, text: list[str], line: int, content: NavigationContent
 ) -> None:
-    """Read Klobuchar coefficients of version 4 (RINEX 4.02, table A34); other models are counted."""
+    """Read the Klobuchar coefficients in an ionosphere record (RINEX 4.02, table A34). Other models are counted."""
     if letter not in "GCJ" or message not in ("LNAV", "D1D2"):
         content.skipped[f"ION {letter} {message}"] += 1
         return
@@ -249,7 +249,7 @@ def _ionosphere_4(
 
 
 def _record(path: FilePath, block: _Block, version: float, content: NavigationContent) -> RawRecord | None:
-    """Read one record; None for a record of a skipped kind, which is counted."""
+    """Read one record. Return None, and count the record, if its constellation or message is skipped."""
     system, digits = block.name[:1], block.name[1:].strip()
     if system not in (*_LINES, *_SKIPPED) or not (digits.isdecimal() and int(digits)):
         raise InputFileError(path, f"{block.name!r} is not a satellite name", line=block.line - (version >= 4.0))
@@ -258,7 +258,7 @@ def _record(path: FilePath, block: _Block, version: float, content: NavigationCo
         content.skipped[f"{system} {block.message}".strip()] += 1
         return None
     fewest, most = _LINES_4.get(block.message, _LINES[system])
-    # Trailing blank lines belong to the record; a further line with fields does not.
+    # Blank lines after the record are ignored; further lines with fields are a fault.
     count = next((k for k in range(len(block.text), fewest, -1) if block.text[k - 1].strip()), fewest)
     count = min(count, len(block.text))
     if not fewest <= count <= most:
@@ -267,7 +267,7 @@ def _record(path: FilePath, block: _Block, version: float, content: NavigationCo
             path, f"record of {satellite} has {count} lines, {fewest} were expected; {fault}", line=block.line
         )
     first = block.text[0]
-    lettered = version >= 3.0 or first[:1].isalpha()  # in RINEX 2.12, a letter shifts all columns by one
+    lettered = version >= 3.0 or first[:1].isalpha()  # a letter, allowed in RINEX 2.12, shifts all columns by one
     try:
         epoch = _instant(first[4:], 4) if version >= 3.0 else _instant(first[2 + lettered :], 3)
     except ValueError:
@@ -287,7 +287,7 @@ def _numbers(path: FilePath, block: _Block, satellite: str, *, shift: int) -> li
     names = list_fields(satellite[0], block.message)
     numbers: list[float] = []
     for k, name in enumerate(names):
-        # The first line has three numbers after satellite and time; other lines have four.
+        # The first line has three numbers, after satellite and time; other lines have four numbers.
         row, place = divmod(k + 1, 4)
         text = block.text[row]
         column = shift - 15 + _WIDTH * place
@@ -300,7 +300,7 @@ def _numbers(path: FilePath, block: _Block, satellite: str, *, shift: int) -> li
 
 
 def _instant(text: str, digits: int) -> np.datetime64:
-    """Parse a time whose year has `digits` characters (3 in RINEX 2, 4 later); raise ValueError if it is invalid."""
+    """Parse a time; its year has `digits` characters (3 in RINEX 2, 4 later). Raise ValueError for an invalid time."""
     year, rest = int(text[:digits]), text[digits:]
     if digits < 4:
         year += 1900 if 80 <= year < 100 else 2000 if year < 80 else 0

@@ -14,17 +14,17 @@ from railfix.core.nearest_times import nearest_day, nearest_week
 from railfix.core.timescale import bdt_to_gpst, seconds, to_week, utc_to_gpst
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords
 
-#: Names of the numbers of a Keplerian record in the order of the file, beginning with three clock coefficients.
+#: Names of the numbers in a Keplerian record, in file order, beginning with three clock coefficients.
 _KEPLER: Final = (
     "af0_s af1 af2 iode crs delta_n m0 cuc eccentricity cus sqrt_a toe_sow_s cic omega0 cis i0 crc omega omega_dot "
     "i_dot data_source week flag accuracy_m health group_delay_1_s group_delay_2_s transmitted fit"
 ).split()
-#: Names of the numbers of a GLONASS record in the order of the file.
+#: Names of the numbers in a GLONASS record, in file order.
 _GLONASS: Final = (
     "clock_bias relative_frequency message_time x x_velocity x_acceleration health "
     "y y_velocity y_acceleration frequency_channel z z_velocity z_acceleration age"
 ).split()
-#: Names of the first numbers of CNAV and of CNV1 to CNV3; CNAV records do not contain toe, because toe equals toc
+#: Names of the first numbers in CNAV and CNV1 to CNV3 records. CNAV records do not contain toe, because toe equals toc
 #: (IS-GPS-200, 30.3.3.1.1).
 _ORBIT_4: Final = (
     "af0_s af1 af2 a_dot crs delta_n m0 cuc eccentricity cus sqrt_a {} cic omega0 cis i0 crc omega omega_dot "
@@ -36,7 +36,7 @@ _CNAV: Final = _ORBIT_4.format("top") + (
 )
 _CNV: Final = _ORBIT_4.format("toe_sow_s") + "kind top sisai_oe sisai_ocb sisai_oc1 sisai_oc2 "
 _CNV_END: Final = " group_delay_1_s group_delay_2_s sismai health flags iodc transmitted spare spare iode"
-#: Names of the numbers of messages introduced by RINEX 4 (4.02, tables A10, A11, A18 to A20).
+#: Names of the numbers in messages that RINEX 4 introduced (4.02, tables A10, A11, A18 to A20).
 _MESSAGES_4: Final[Mapping[str, str]] = {
     **dict.fromkeys(("G CNAV", "J CNAV"), _CNAV + "transmitted week"),
     **dict.fromkeys(("G CNV2", "J CNV2"), _CNAV + "inter_signal_4 inter_signal_5 spare spare transmitted week"),
@@ -44,7 +44,7 @@ _MESSAGES_4: Final[Mapping[str, str]] = {
     "C CNV2": _CNV + "spare inter_signal_1" + _CNV_END,
     "C CNV3": _CNV + "sismai health flags group_delay_1_s transmitted",
 }
-#: Names of the numbers of a record by constellation, and by constellation and message where they differ.
+#: Names of the numbers in a record by constellation, or by constellation and message if the message differs.
 FIELDS: Final[Mapping[str, Sequence[str]]] = {
     **dict.fromkeys("GJEC", _KEPLER),
     "R": _GLONASS,
@@ -55,8 +55,8 @@ _NEEDED: Final = frozenset(
     "af0_s sqrt_a eccentricity m0 toe_sow_s omega0 i0 omega omega_dot "
     "clock_bias x x_velocity y y_velocity z z_velocity".split()
 )
-#: Limits of plausible numbers: clock biases within a second, semi-major axes of about 10 000 to 70 000 km, angles
-#: within a turn, small harmonic corrections, and times of week within a week.
+#: Lower and upper limits of plausible numbers. The limits of `sqrt_a` correspond to semi-major axes of about 10 000 to
+#: 70 000 km.
 _BETWEEN: Final[Mapping[str, tuple[float, float]]] = {
     "sqrt_a": (3.1e3, 8.4e3),
     "eccentricity": (0.0, 0.3),
@@ -79,8 +79,8 @@ _BETWEEN: Final[Mapping[str, tuple[float, float]]] = {
 }
 _OTHERS_BETWEEN: Final = (-1e10, 1e10)  #: Limits of all other numbers.
 _BLANK: Final = float("nan")
-_UNKNOWN: Final = 0.99e9  #: Magnitudes from this value to 1.01E9 mean an unknown number; RINEX writes 0.9999E9.
-_TRANSMISSION_S: Final = 2 * 86_400.0  #: Transmission times farther than this from toe are invalid [s].
+_UNKNOWN: Final = 0.99e9  #: Magnitudes between this value and 1.01E9 mean an unknown number (0.9999E9 in RINEX).
+_TRANSMISSION_S: Final = 2 * 86_400.0  #: Largest valid difference between transmission time and toe [s].
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class RawRecord:
     system: str
     satellite: str
     message: str
-    epoch: np.datetime64  #: Clock reference time in the time system of the constellation (UTC for GLONASS).
+    epoch: np.datetime64  #: Clock reference time in the constellation's time system (UTC for GLONASS).
     numbers: list[float]  #: Numbers of the record in RINEX order (`fields`); NaN where blank.
     version: float
 
@@ -101,12 +101,12 @@ class RawRecord:
 
 
 def list_fields(system: str, message: str) -> Sequence[str]:
-    """Return the names of the numbers of a message in the order of the file."""
+    """Return the names of the numbers in a record, in file order."""
     return FIELDS.get(f"{system} {message}", FIELDS[system])
 
 
 def number(text: str) -> float:
-    """Parse a FORTRAN number; blank and 0.9999E9 give the same NaN object, so that equal records compare equal.
+    """Parse a FORTRAN number. Blank and 0.9999E9 return the same NaN object, so that equal records compare equal.
 
     Raise ValueError if the text is not a finite number.
     """
@@ -120,7 +120,7 @@ def number(text: str) -> float:
 
 
 def first_fault(record: RawRecord) -> tuple[int, str] | None:
-    """Return the index and a description of the first impossible number; None for a valid record."""
+    """Return the index and a description of the first implausible number, or None for a valid record."""
     for k, (name, value) in enumerate(zip(record.fields, record.numbers, strict=True)):
         if name in _NEEDED and math.isnan(value):
             return k, f"{name} is blank"
@@ -131,7 +131,7 @@ def first_fault(record: RawRecord) -> tuple[int, str] | None:
 
 
 def kepler_records(raw: Sequence[RawRecord]) -> KeplerRecords:
-    """Convert Keplerian records; blank rates, corrections, health and issues are read as 0, as defined by RINEX."""
+    """Convert Keplerian records. Blank rates, corrections, health and issues are read as 0, as RINEX specifies."""
     column = _columns(raw)
     satellite = np.array([r.satellite for r in raw], dtype="<U3")
     system = satellite.astype("<U1")
@@ -139,7 +139,7 @@ def kepler_records(raw: Sequence[RawRecord]) -> KeplerRecords:
     of_clock = np.isnan(column["toe_sow_s"])
     column["toe_sow_s"] = np.where(of_clock, to_week(own)[1], column["toe_sow_s"])
     toe = np.where(of_clock, own, nearest_week(column["toe_sow_s"], own))
-    # The week follows from the clock reference time, because week numbers of converted files may be wrong by 1024.
+    # The week is taken from the clock reference time, because week numbers in converted files may be wrong by 1024.
     sent_sow = column["transmitted"]
     usable = np.abs(np.where(np.isnan(sent_sow), np.inf, sent_sow)) < 2 * 604_800
     sent = nearest_week(np.where(usable, sent_sow, 0.0), toe)
@@ -147,8 +147,8 @@ def kepler_records(raw: Sequence[RawRecord]) -> KeplerRecords:
     beidou = system == "C"
     gps_like = np.isin(system, ["G", "J"])
     integers = {name: _integers(column[name]) for name in ("iode", "health", "data_source")}
-    # The field of IODC has the second group delay for Galileo and BeiDou. BeiDou's AODC is in the field of the fit
-    # interval.
+    # GPS and QZSS records have the IODC in the field that is the second group delay in Galileo and BeiDou records.
+    # BeiDou records have the AODC in the field of the fit interval.
     cnv = ~np.isnan(column["iodc"])
     iodc = np.select(
         [gps_like, cnv, beidou], [column["group_delay_2_s"], column["iodc"], column["fit"]], column["iode"]
@@ -179,7 +179,7 @@ def kepler_records(raw: Sequence[RawRecord]) -> KeplerRecords:
 
 
 def _columns(raw: Sequence[RawRecord]) -> dict[str, Floats]:
-    """Return the numbers of all records by name, shape (n,) each; NaN where a message lacks the number."""
+    """Return the numbers of all records by name, shape (n,) each, NaN where a message lacks the number."""
     names = {name for key, own in FIELDS.items() if key != "R" for name in own}
     column = {name: np.full(len(raw), _BLANK) for name in names}
     layouts: dict[tuple[str, ...], list[int]] = {}
@@ -193,7 +193,7 @@ def _columns(raw: Sequence[RawRecord]) -> dict[str, Floats]:
 
 
 def _ura_m(index: Floats) -> Floats:
-    """Return the nominal accuracy [m] of a URA_ED index, 8192 m without prediction (IS-GPS-200, 30.3.3.1.1.4)."""
+    """Return the nominal accuracy [m] of a URA_ED index (IS-GPS-200, 30.3.3.1.1.4); 8192 m means no prediction."""
     metres = 2.0 ** np.where(index <= 6, 1.0 + index / 2.0, index - 2.0)
     return np.where((index == 15) | (index == -16), 8192.0, metres)
 
@@ -203,7 +203,7 @@ def _integers(values: Floats) -> Integers:
 
 
 def _messages(raw: Sequence[RawRecord], system: Strings, source: Integers, satellite: Strings) -> Strings:
-    """Return the message names; before RINEX 4 they follow from Galileo's data source and BeiDou's GEO numbers."""
+    """Return the message names, derived before RINEX 4 from Galileo data source and BeiDou GEO numbers."""
     number = np.array([int(s[1:]) for s in satellite.tolist()], dtype=np.int64)
     geo = (number <= 5) | (number >= 59)
     fnav = ((source & 0b010) != 0) & ((source & 0b101) == 0)
@@ -215,7 +215,7 @@ def _messages(raw: Sequence[RawRecord], system: Strings, source: Integers, satel
 
 
 def _fit_interval(system: Strings, fit: Floats) -> Floats:
-    """Compute the fit interval [h] of GPS (0 means 4 h, 1 means 6 h) and QZSS (0 means 2 h, 1 means 4 h), else NaN."""
+    """Return the fit interval [h], NaN except for GPS (0 means 4 h, 1 means 6 h) and QZSS (0: 2 h, 1: 4 h)."""
     fit = np.nan_to_num(fit)
     gps = np.where(fit == 0, 4.0, np.where(fit == 1, 6.0, fit))
     qzss = np.where(fit == 0, 2.0, np.where(fit == 1, 4.0, fit))
@@ -223,14 +223,14 @@ def _fit_interval(system: Strings, fit: Floats) -> Floats:
 
 
 def glonass_records(raw: Sequence[RawRecord]) -> GlonassRecords:
-    """Convert GLONASS records, with times from UTC to GPS time and lengths from kilometres to metres."""
+    """Convert GLONASS records: times from UTC to GPS time, and lengths from kilometres to metres."""
     table = np.array([r.numbers for r in raw], dtype=np.float64).reshape(len(raw), len(_GLONASS))
     state = table[:, 3:15].reshape(-1, 3, 4)
     utc = np.array([r.epoch for r in raw], dtype="datetime64[ns]")
     toe = utc_to_gpst(utc)
     frame = table[:, 2]
     known = np.isfinite(frame) & (np.abs(frame) < 1e6)
-    # RINEX 2 writes seconds of the day, RINEX 3 and 4 seconds of the week, both in UTC.
+    # The message frame time is in seconds of the UTC day in RINEX 2, and of the UTC week in RINEX 3 and 4.
     old = np.array([r.version < 3.0 for r in raw], dtype=bool)
     frame = np.where(known, frame, 0.0)
     sent = np.where(old, nearest_day(frame % 86_400.0, utc), nearest_week(frame, utc))

@@ -20,15 +20,15 @@ from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.io.rinex.navigation_records import FIELDS
 from railfix.io.rinex.write import Packing, RinexVersion, header_line, open_target, program_line
 
-UNKNOWN_S: Final = 0.9999e9  #: Value of an unknown transmission time, and of CNV1 fields that the records lack.
-_IONOSPHERE: Final = {"G": "GPS", "J": "QZS", "C": "BDS"}  #: Name of a constellation's Klobuchar coefficients.
+UNKNOWN_S: Final = 0.9999e9  #: Value written for unknown numbers.
+_IONOSPHERE: Final = {"G": "GPS", "J": "QZS", "C": "BDS"}  #: Name of the Klobuchar coefficients by constellation.
 #: Messages whose Keplerian records can be written, by RINEX version.
 _WRITTEN: Final[dict[RinexVersion, tuple[str, ...]]] = {
     "3.04": ("LNAV", "INAV", "FNAV", "D1", "D2"),
     "4.02": ("LNAV", "INAV", "FNAV", "D1", "D2", "CNV1"),
 }
 _BLANK: Final = " " * 19
-#: Last line of a GLONASS record of version 4: flags, group delay and accuracy, which `GlonassRecords` lacks.
+#: Last line of a version 4 GLONASS record (flags, group delay, accuracy); `GlonassRecords` lacks these values.
 _GLONASS_STATUS: Final = f"    {_BLANK}{'.999999999999E+09':>19}{_BLANK}{_BLANK}".rstrip() + "\n"
 
 
@@ -43,18 +43,17 @@ def write_navigation(
 ) -> None:
     """Write a RINEX navigation file; a failed write leaves no file.
 
-    Records are sorted by clock time, then satellite. Fields that `Navigation` lacks (L2 code and P flags, the GLONASS
-    status words) are written as 0, NaN as blank, an unknown transmission time and additional fields of CNV1 as
-    0.9999E9. `precise` is not written.
+    Records are sorted by clock time, then satellite. NaN is written as blank, and the L2 P data flag as 0. Unknown
+    transmission times, and CNV1 fields that `Navigation` lacks, are written as 0.9999E9. `precise` is not written.
 
     Parameters
     ----------
     navigation : Navigation
     path : path-like
     packing : {"plain", "gz"}, optional
-        By default from the file name (``.gz``).
+        Default: "gz" if the file name ends in ``.gz``, else "plain".
     version : {"3.04", "4.02"}
-        Version 4 names the message of each record, and stores the ionospheric coefficients as records.
+        Version 4 files name the message of each record, and have the ionospheric coefficients in records.
     comments : sequence of str
         Comment lines of at most 60 ASCII characters.
     created : datetime64, optional
@@ -63,7 +62,7 @@ def write_navigation(
     Raises
     ------
     ValueError
-        `packing` is Hatanaka, which exists for observations only; or a record cannot be written in this version.
+        `packing` is Hatanaka, which exists for observations only, or a record cannot be written in this version.
     OutputError
         The file cannot be written.
     """
@@ -112,7 +111,7 @@ def write_navigation(
 
 
 def with_written_messages(navigation: Navigation, version: RinexVersion = "3.04") -> tuple[Navigation, dict[str, int]]:
-    """Return the records that can be written, and the number of other records by constellation and message."""
+    """Return the navigation data that can be written, and counts of omitted records by constellation and message."""
     kepler = navigation.kepler
     kept = np.isin(kepler.message, _WRITTEN[version])
     kinds = zip(kepler.satellite[~kept].tolist(), kepler.message[~kept].tolist(), strict=True)
@@ -121,13 +120,13 @@ def with_written_messages(navigation: Navigation, version: RinexVersion = "3.04"
 
 
 def check_messages(records: KeplerRecords, version: RinexVersion) -> None:
-    """Raise ValueError if the message of a record cannot be written in this version."""
+    """Raise ValueError if a record is of a message that cannot be written in this version."""
     if (other := ~np.isin(records.message, _WRITTEN[version])).any():
         raise ValueError(f"records of {records.message[other][0]} cannot be written; leave them out")
 
 
 def _ionosphere_records(navigation: Navigation) -> str:
-    """Return Klobuchar coefficients as records of version 4 (RINEX 4.02, table A34), dated with the first toc."""
+    """Return the Klobuchar coefficients as version 4 records (RINEX 4.02, table A34), dated with the first toc."""
     if not len(navigation.kepler):
         return ""
     first = str(_calendar_text(navigation.kepler.toc[:1].min())).strip()
@@ -146,7 +145,7 @@ def _field(values: Floats) -> Strings:
 
 
 def _records(satellite: Strings, time: Datetimes, numbers: Floats) -> Strings:
-    """Format records: satellite, time, three clock fields, then four fields per line without trailing blanks."""
+    """Format records: one line with satellite, time and three clock fields, then lines of four fields."""
     text = np.char.add(satellite, _calendar_text(time))
     for i, values in enumerate(numbers.T):
         if i >= 3 and i % 4 == 3:
@@ -164,9 +163,9 @@ def _calendar_text(time: Datetimes) -> Strings:
 
 
 def kepler_numbers(records: KeplerRecords, names: Sequence[str]) -> tuple[Datetimes, Floats]:
-    """Return the toc in the constellation's time, and the numbers `names` of `FIELDS`, shape (n, numbers).
+    """Return the toc in the constellation's time, shape (n,), and the numbers `names`, shape (n, numbers).
 
-    Raise ValueError if a constellation has no Keplerian records in RINEX.
+    Raise ValueError if RINEX has no Keplerian records for a constellation.
     """
     letter = records.satellite.astype("<U1")
     unknown = np.unique(letter[~np.isin(letter, ["G", "J", "E", "C"])])
@@ -177,7 +176,7 @@ def kepler_numbers(records: KeplerRecords, names: Sequence[str]) -> tuple[Dateti
     shift = timedelta(np.where(beidou, BDT_MINUS_GPST_S, 0.0))
     toc = np.asarray(records.toc + shift, dtype="datetime64[ns]")
     week, sent = _week_and_transmission(records, shift, beidou)
-    # For QZSS, a flag is written instead of hours: 0 for two hours, 1 for longer.
+    # A QZSS record has a flag instead of the fit interval: 0 for two hours, 1 for longer.
     fit = np.where(
         letter == "J",
         np.where(np.isnan(records.fit_interval_h), np.nan, records.fit_interval_h > 2.0),
@@ -199,10 +198,10 @@ def kepler_numbers(records: KeplerRecords, names: Sequence[str]) -> tuple[Dateti
 def _week_and_transmission(
     records: KeplerRecords, shift: NDArray[np.timedelta64], beidou: Masks
 ) -> tuple[Floats, Floats]:
-    """Compute the constellation's week number of toe, and the seconds of this week at transmission."""
+    """Return the week number of toe in the constellation's time, and the transmission time in seconds of this week."""
     week, _ = to_week(records.toe + shift)
     origin = np.where(beidou, BDT_EPOCH, GPS_EPOCH)
-    # Both counts of weeks begin on a Sunday.
+    # GPS weeks and BeiDou weeks both begin on a Sunday.
     own = week - np.asarray((origin - GPS_EPOCH) // np.timedelta64(7, "D"), dtype=np.int64)
     start = GPS_EPOCH + (week * SECONDS_PER_WEEK).astype("timedelta64[s]")
     sent = seconds(records.transmitted + shift - start)
@@ -210,7 +209,7 @@ def _week_and_transmission(
 
 
 def glonass_numbers(records: GlonassRecords) -> tuple[Datetimes, Floats]:
-    """Return the toe in UTC, and the numbers in file order with lengths in kilometres, shape (n, numbers)."""
+    """Return the toe in UTC, and the numbers in file order, shape (n, numbers). Lengths are in kilometres."""
     toe, sent = gpst_to_utc(records.toe), gpst_to_utc(records.transmitted)
     frame = seconds(sent - GPS_EPOCH)
     position, velocity, acceleration = (

@@ -1,9 +1,8 @@
 """Reader of RINEX 2, 3 and 4 observation files of one receiver.
 
-Reading in pieces and reading at once use the same code. With ``broken_lines="stop"``, a malformed line raises
-`InputFileError`. With "count", the part that cannot be read because of the line (a record, satellite, epoch or the rest
-of the file) is skipped, counted and described in `Observations.problems`. An error in the header that changes how the
-file is read is always raised.
+With ``broken_lines="stop"``, a malformed line raises `InputFileError`. With "count", the part that the line makes
+unreadable (a record, a satellite, an epoch or the rest of the file) is skipped, counted and described in
+`Observations.problems`. A header error that affects how epochs are read is always raised.
 """
 
 from __future__ import annotations
@@ -34,31 +33,31 @@ from railfix.io.rinex.observations_epochs import (
 )
 from railfix.io.rinex.observations_lines import SYSTEMS, EpochHeads, Lines, split_lines
 
-#: Bytes of text in a block: large enough for array operations, small enough for the processor's cache.
+#: Bytes of text that are decoded at a time: many lines for array operations, but not more than the processor's cache.
 BLOCK_BYTES: Final = 4 << 20
-#: Longest accepted line [bytes]. Failing recorders fill lines with zeros, but these lines are shorter.
+#: Longest accepted line [bytes]. Lines that a failing recorder filled with zeros are shorter.
 _MAX_LINE_BYTES: Final = 8 << 20
 _BLANKS: Final = b" " * PADDING
-#: Conversions to GPS time; other systems equal it.
+#: Conversions to GPS time; other time systems equal GPS time.
 _TO_GPST: Final = {"GLO": utc_to_gpst, "UTC": utc_to_gpst, "BDT": bdt_to_gpst}
 _BEFORE_ALL: Final = np.iinfo(np.int64).min
 
 
 @dataclass(frozen=True, kw_only=True)
 class Selection:
-    """Part of a log to read, and policy for malformed lines."""
+    """Part of a log to read, and treatment of malformed lines."""
 
     broken_lines: BrokenLines = "stop"
-    systems: frozenset[str] | None = None  #: Constellation letters, None for all.
-    start_ns: int = _BEFORE_ALL  #: First time, GPS time since 1970 [ns].
-    end_ns: int = int(np.iinfo(np.int64).max)  #: End, not included, GPS time since 1970 [ns].
+    systems: frozenset[str] | None = None  #: Constellation letters; None means all.
+    start_ns: int = _BEFORE_ALL  #: Earliest time that is read, GPS time since 1970 [ns].
+    end_ns: int = int(np.iinfo(np.int64).max)  #: Only times before it are read [ns].
 
 
 class BlockReader:
-    """Reader of one file in file order.
+    """Reader of one observation file in file order.
 
-    `epochs` is the number of epochs read, `share` the fraction of the file read, and `last_ns` the median time of the
-    last block [ns]. An incomplete last record is left out, with a note.
+    `epochs` is the number of epochs read so far, `share` the fraction of the file read, and `last_ns` the median time
+    of the last block [ns]. An incomplete record at the end of the file is skipped with a note.
     """
 
     def __init__(self, path: FilePath, selection: Selection, *, block_bytes: int = BLOCK_BYTES) -> None:
@@ -72,7 +71,7 @@ class BlockReader:
         self._break = False
 
     def blocks(self) -> Generator[FileEpochs]:
-        """Yield runs of epochs in the order of the file; a run may be empty."""
+        """Yield runs of consecutive epochs in file order; a run may be empty."""
         with open_stream(self.path) as stream:
             head, rest = read_header_bytes(stream)
             header = parse_header(self.path, head, log=self._log)
@@ -112,9 +111,9 @@ class BlockReader:
         return block, not block
 
     def _part(self, lines: Lines, header: RinexHeader, *, at_end: bool) -> tuple[FileEpochs, RinexHeader, int]:
-        """Read the epochs up to the end of the lines or a change of the observation types.
+        """Read the epochs up to the end of `lines`, or up to header records that change how epochs are read.
 
-        Return the epochs, the header after them, and the number of lines read.
+        Return the epochs, the header that applies after them, and the number of lines read.
         """
         trial = self._log.fresh()
         table, taken = self._find(lines, header, at_end=at_end, log=trial)
@@ -126,7 +125,7 @@ class BlockReader:
             first, count = int(table.line[k]) + 1, int(table.count[k])
             after = self._event(lines[first : first + count], after)
             if after.reading != header.reading:
-                taken = first + count  # lines after the change have other types; only the lines before it are decoded
+                taken = first + count  # only the lines before the change are decoded now
                 trial = self._log.fresh()
                 table, _ = self._find(lines[:taken], header, at_end=True, log=trial)
                 break
@@ -161,7 +160,7 @@ class BlockReader:
             time_ns = _TO_GPST[header.time_system](time_ns.astype("datetime64[ns]")).astype(np.int64)
         self.epochs += len(time_ns)
         if len(time_ns):
-            self.last_ns = int(np.median(time_ns))  # the median, because single tags may be wrong
+            self.last_ns = int(np.median(time_ns))  # median, because single time tags may be wrong
         kept = (time_ns >= self._selection.start_ns) & (time_ns < self._selection.end_ns)
         epochs, breaks_at, time_ns = epochs[kept], breaks_at[kept], time_ns[kept]
         before = np.diff(breaks_at, prepend=0) > 0
@@ -187,7 +186,7 @@ DEFAULT_EPOCHS: Final = 3600
 _PEEK_BYTES: Final = 1 << 16
 #: Length of a piece divided by the length of the first piece.
 _FIRST_PART: Final = 5
-_GAP_INTERVALS: Final = 1.5  #: A step between files is a gap when it is longer than this many intervals.
+_GAP_INTERVALS: Final = 1.5  #: A longer time between two files is a gap [observation intervals].
 
 
 def scan_observations(
@@ -203,8 +202,8 @@ def scan_observations(
     """Return an iterator over the observations of one receiver in pieces of at most `epochs` epochs.
 
     The other arguments are as in `railfix.read_observations`. The first piece is shorter (`in_pieces`). Each piece has
-    only the channels that occur in it; the concatenated pieces are the log. Memory use is one piece and one block of
-    text. `progress` is called with the fraction of the files that has been read, 0 to 1.
+    only the channels that occur in it. At any time, only one piece and one block of text are in memory. `progress` is
+    called with the fraction of the files that has been read, 0 to 1.
     """
     if epochs < 1:
         raise ValueError(f"a piece has at least one epoch, epochs={epochs} was requested")
@@ -224,8 +223,8 @@ def _runs(
 ) -> Iterator[Observations]:
     """Yield runs of epochs of all files in order of time.
 
-    Raise InputFileError if no file has a usable epoch, and MismatchError if no epoch is selected or consecutive files
-    are more than a week apart.
+    Raise InputFileError if no file has a usable epoch. Raise MismatchError if no epoch is selected, or if consecutive
+    files begin more than a week apart.
     """
     firsts = [first_time(path) for path in paths] if len(paths) > 1 else []
     if firsts:
@@ -254,7 +253,7 @@ def _runs(
 def _of_files(
     readers: list[BlockReader], selection: Selection, progress: Callable[[float], None] | None
 ) -> Iterator[FileEpochs]:
-    """Yield the runs of consecutive files, with `break_before` where there is a gap between two files."""
+    """Yield the runs of consecutive files; `break_before` is set after a gap between two files."""
     last: Observations | None = None
     for k, reader in enumerate(readers):
         joint = last is not None
@@ -286,13 +285,13 @@ def check_one_run(paths: Sequence[str], firsts: Sequence[np.datetime64]) -> None
 
 
 def first_time(path: str) -> np.datetime64:
-    """Return the time of the first epoch of a file, NaT if it has none."""
+    """Return the time of the first epoch in a file, or NaT if the file has no epochs."""
     with closing(BlockReader(path, Selection(broken_lines="count"), block_bytes=_PEEK_BYTES).blocks()) as runs:
         return next((epochs.time[0] for _, epochs, _ in runs if len(epochs)), np.datetime64("NaT", "ns"))
 
 
 def with_break_at_gap(last: Observations | None, run: Observations) -> Observations:
-    """Return `run` with `break_before` set at its first epoch, unless it follows `last` within 1.5 intervals."""
+    """Return `run`, with `break_before` set at its first epoch if there is a gap of over 1.5 intervals after `last`."""
     if last is None:
         return run
     interval = run.header.interval_s
@@ -307,8 +306,7 @@ def with_break_at_gap(last: Observations | None, run: Observations) -> Observati
 
 
 def in_pieces(runs: Iterator[Observations], epochs: int) -> Iterator[Observations]:
-    """Divide runs into pieces of `epochs` epochs. The first piece has a fifth of this length, so that processing begins
-    early.
+    """Divide runs into pieces of `epochs` epochs. The first piece is a fifth as long, so that processing begins early.
 
     Each problem is reported in the piece that was being collected when the problem was found.
     """
@@ -320,7 +318,7 @@ def in_pieces(runs: Iterator[Observations], epochs: int) -> Iterator[Observation
         if length <= size:
             continue
         joined, at = concatenate(waiting), 0
-        while length > size:  # keep the last piece: faults at the end of the file belong to it
+        while length > size:  # the last piece waits: it gets the problems found at the file end
             piece = without_empty_channels(joined[at : at + size])
             if at == 0:
                 problems, count = joined.problems, joined.problem_count
@@ -332,7 +330,7 @@ def in_pieces(runs: Iterator[Observations], epochs: int) -> Iterator[Observation
 
 
 def without_empty_channels(observations: Observations) -> Observations:
-    """Drop the channels that have neither an observation nor a loss-of-lock digit."""
+    """Drop the channels that have no observation and no loss-of-lock digit."""
     arrays = ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz")
     used = channels_with_data([getattr(observations, name) for name in arrays], observations.loss_of_lock)
     return observations if used.all() else of_channels(observations, used)

@@ -1,9 +1,9 @@
-"""Decode satellite lines to dense arrays of epochs by channels, without Python loops over epochs or channels.
+"""Decode satellite lines to arrays of epochs by channels, without Python loops over epochs or channels.
 
-A field of sixteen characters is held in two 64-bit words. Eight digits in one word are converted to their value by
-three multiplications (L. Lamport, "Multiple byte processing with full-word instructions", CACM 18(8), 1975,
-doi:10.1145/360933.360994). The exact integer of thousandths divided by 1000 equals ``float(text)``. Fields of other
-forms are read one by one with `float`.
+A field of sixteen characters fits in two 64-bit words. The value of eight digits in one word is computed by three
+multiplications (L. Lamport, "Multiple byte processing with full-word instructions", CACM 18(8), 1975,
+doi:10.1145/360933.360994). The result is an exact number of thousandths, so its division by 1000 equals
+``float(text)``. Fields that do not have three decimals are read one by one with `float`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from railfix.io.rinex.observations_lines import KINDS, SYSTEMS, EpochHeads, Line
 Words = NDArray[np.uint64]
 
 FIELD_WIDTH: Final = 16  #: Number of characters per field.
-#: Number of blanks that must follow a block, so that fields can be loaded beyond its end.
+#: Number of blanks that must follow a block, because fields are also loaded beyond the end of short lines.
 PADDING: Final = 2048
 
 _U = np.uint64
@@ -36,14 +36,16 @@ _BLANKS: Final = _U(0x2020202020202020)
 _NUMBER: Final = re.compile(r" *[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d{1,2})?")
 _DIGIT_OR_BLANK: Final = re.compile("[ 0-9]{2}")
 
-#: Bit masks that keep the first 0 to 16 characters of a field, shape (17, 2).
+#: Bit masks for the first n characters of a field, n from 0 to 16, shape (17, 2).
 _KEEP: Final = np.array(
     [[(1 << 8 * min(n, 8)) - 1, (1 << 8 * max(n - 8, 0)) - 1] for n in range(FIELD_WIDTH + 1)], dtype=np.uint64
 )
 
 
 def gather(data: Bytes, start: Integers, length: Integers, count: int) -> Words:
-    """Gather `count` fields of lines as pairs of little-endian 64-bit words (n, count, 2), blank beyond `length`."""
+    """Return `count` fields of each line as pairs of little-endian 64-bit words, shape (n, count, 2), blank beyond a
+    line.
+    """
     width = FIELD_WIDTH * count
     if width > PADDING:
         raise ValueError(f"a line of {count} fields is longer than the padding of {PADDING} bytes")
@@ -62,11 +64,11 @@ def gather(data: Bytes, start: Integers, length: Integers, count: int) -> Words:
 def read_fields(
     data: Bytes, start: Integers, length: Integers, index: Indices, divisor: Floats
 ) -> tuple[Floats, Bytes, Masks]:
-    """Return values, loss-of-lock digits and a mask of bad fields for n satellite lines by k types, shape (n, k).
+    """Return values, loss-of-lock digits and bad-field flags of n satellite lines and k types, shape (n, k) each.
 
-    Values are NaN where blank or bad, and digits are 0 there. A field is bad if it is neither blank nor a number, or if
-    one of its two indicators is neither blank nor a digit. `index` is the field number of each type, shape (k,), and
-    `divisor` the scale factor of each type (SYS / SCALE FACTOR), shape (k,); the other arguments are as in `gather`.
+    The value of a blank or bad field is NaN, and its digit is 0. A field is bad if it is neither blank nor a number, or
+    if one of its two indicators is neither blank nor a digit. `index` is the field number of each type, and `divisor`
+    its scale factor (SYS / SCALE FACTOR), shape (k,) each. The other arguments are as in `gather`.
     """
     value, lock, odd = kernels.reading.decode_fields(data, start, length, index, divisor)
     bad = np.zeros(value.shape, dtype=np.bool_)
@@ -81,7 +83,7 @@ def read_fields(
 
 
 def _read_slowly(flat: Words) -> tuple[Floats, Masks]:
-    """Read decimal numbers of any form that end in the value's last column; return values and a mask of bad fields."""
+    """Read right-aligned decimal numbers of any form. Return the values and a mask of bad fields."""
     value = np.full(len(flat), np.nan)
     wrong = np.ones(len(flat), dtype=np.bool_)
     characters = flat.tobytes().decode("latin-1")
@@ -108,11 +110,11 @@ _LETTERS: Final = range(ord("A"), ord("Z") + 1)
 
 @dataclass(frozen=True)
 class DecodedRows:
-    """Satellites of consecutive epochs, n rows."""
+    """Satellites of consecutive epochs, one row per satellite and epoch, n rows."""
 
     epoch: Integers  #: Index of the epoch, shape (n,).
     letter: Bytes  #: Constellation letter as ASCII code, shape (n,).
-    number: Integers  #: Number of the satellite, -1 if it cannot be read; shape (n,).
+    number: Integers  #: Satellite number, -1 if unreadable; shape (n,).
     line: Integers  #: Index of the first observation line of the satellite in `Lines`, shape (n,).
 
     def __getitem__(self, which: Masks | Integers) -> DecodedRows:
@@ -120,14 +122,14 @@ class DecodedRows:
 
 
 def lines_per_satellite(header: RinexHeader) -> int:
-    """Return the number of observation lines per satellite, which is 1 from RINEX 3."""
+    """Return the number of observation lines per satellite, which is 1 from RINEX 3 on."""
     return max(-(-len(header.get_types("G") or ()) // FIELDS_PER_LINE), 1) if header.version < 3.0 else 1
 
 
 def decode(
     lines: Lines, epochs: EpochHeads, *, header: RinexHeader, systems: frozenset[str] | None, log: FaultLog
 ) -> dict[str, Any]:
-    """Decode the observations of epochs (flags 0 and 1) to dense arrays by the field names of `Observations`."""
+    """Decode the observations of epochs (flags 0 and 1); return arrays by the field names of `Observations`."""
     rows = _rows(lines, epochs, header)
     rows = _select(lines, rows, header=header, systems=systems, log=log)
     rows = _without_repeats(lines, rows, len(epochs), log)
@@ -167,7 +169,7 @@ def _rows(lines: Lines, epochs: EpochHeads, header: RinexHeader) -> DecodedRows:
 def _select(
     lines: Lines, rows: DecodedRows, *, header: RinexHeader, systems: frozenset[str] | None, log: FaultLog
 ) -> DecodedRows:
-    """Select the rows with a valid satellite name and a known, selected and declared constellation; count others."""
+    """Return the rows with a valid satellite name and a known, selected and declared constellation; count others."""
     broken = rows.number < 0
     log.faults(
         SATELLITES,
@@ -199,7 +201,7 @@ def _is_any(letter: Bytes, letters: Iterable[str]) -> Masks:
 
 
 def _number(key: Integers) -> tuple[Integers, Integers]:
-    """Return the distinct small numbers in ascending order, and the index of each number among them."""
+    """Return the distinct numbers in ascending order, and the index of each number among the distinct numbers."""
     occurs = np.zeros(int(key.max(initial=0)) + 1, dtype=np.bool_)
     occurs[key] = True
     return np.flatnonzero(occurs), (np.cumsum(occurs) - 1)[key]
@@ -210,7 +212,7 @@ def _name(rows: DecodedRows, i: int) -> str:
 
 
 def _without_repeats(lines: Lines, rows: DecodedRows, epochs: int, log: FaultLog) -> DecodedRows:
-    """Keep only the first row of a satellite that occurs twice in an epoch; record further rows as faults."""
+    """Keep the first row of each satellite in an epoch. Further rows of the satellite are recorded as faults."""
     key = rows.letter.astype(np.int64) * 100 + rows.number
     names, name = _number(key)
     row = np.arange(len(key))
@@ -232,7 +234,7 @@ def _without_repeats(lines: Lines, rows: DecodedRows, epochs: int, log: FaultLog
 def _values(
     lines: Lines, rows: DecodedRows, system: str, columns: tuple[SignalColumn, ...], header: RinexHeader, log: FaultLog
 ) -> tuple[DecodedRows, Floats, Bytes]:
-    """Return rows, values and loss-of-lock digits of the chosen columns; rows with faults are dropped and recorded."""
+    """Return the rows, values and loss-of-lock digits in `columns`. Rows with faults are omitted, but recorded."""
     count = len(header.get_types(system) or ())
     width, before = (count, 3) if header.version >= 3.0 else (FIELDS_PER_LINE, 0)
     too_long = np.zeros(len(rows.line), dtype=np.bool_)
@@ -283,7 +285,7 @@ def _continues(data: Bytes, start: Integers, length: Integers, width: int) -> Ma
 def _scatter(
     parts: list[tuple[str, DecodedRows, Floats, Bytes, tuple[SignalColumn, ...]]], epochs: int
 ) -> dict[str, Any]:
-    """Fill arrays of epochs by channels; channels without any observation are dropped."""
+    """Arrange decoded values in arrays of epochs by channels. Channels without any observation are omitted."""
     satellites: list[str] = []
     signals: list[str] = []
     placed = []

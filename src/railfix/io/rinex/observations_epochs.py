@@ -31,15 +31,15 @@ _CONSEQUENCE = {
 
 
 class FaultLog:
-    """Faults of one file; with `broken_lines` "stop", `settle` raises the first fault.
+    """Faults of one file. With `broken_lines` "stop", `settle` raises the first fault as an error.
 
-    A fault in the last line of the file, which may be incomplete where a recording ends, is only noted.
+    A fault in the last line is only noted, because this line may be incomplete.
     """
 
     def __init__(self, path: str, *, broken_lines: BrokenLines) -> None:
         self.path = path
         self.stops = broken_lines == "stop"
-        self.last_line = 0  #: Number of the last line of the file, once it is read.
+        self.last_line = 0  #: Number of the last line of the file; 0 until it has been read.
         self.counts: dict[str, int] = {}
         self._messages: list[str] = []
         self._problems = 0
@@ -62,7 +62,7 @@ class FaultLog:
             self._messages.append(f"{self.path}, line {line}: {message}; {_CONSEQUENCE[kind]}")
 
     def faults(self, kind: str, lines: Integers, message: Callable[[int], str]) -> None:
-        """Record faults of one kind at ascending line numbers; only the first faults are described, by `message(i)`."""
+        """Record faults of one kind at ascending line numbers. Only the first are described, by `message(i)`."""
         described = 1 if self.stops else MAX_PROBLEMS
         for i, line in enumerate(lines[:described].tolist()):
             self.fault(kind, line, message(i))
@@ -76,13 +76,13 @@ class FaultLog:
         self.remark(message)
 
     def remark(self, message: str) -> None:
-        """Store the complete message about a deviation from the format that loses no data."""
+        """Store the complete message about a deviation from the format by which no data are lost."""
         self._problems += 1
         if len(self._messages) < MAX_PROBLEMS:
             self._messages.append(message)
 
     def fresh(self) -> FaultLog:
-        """Return an empty log of the same file, for a trial that may be discarded."""
+        """Return an empty log of the same file, for a trial whose faults may be discarded."""
         log = FaultLog(self.path, broken_lines="stop" if self.stops else "count")
         log.last_line = self.last_line
         return log
@@ -97,18 +97,18 @@ class FaultLog:
             self._first = other._first
 
     def settle(self) -> None:
-        """Raise the first fault of the file as InputFileError, if `broken_lines` is "stop"."""
+        """Raise the file's first fault as InputFileError if `broken_lines` is "stop"."""
         if self.stops and self._first is not None:
             raise InputFileError(self.path, f"{self._first[1]}; {LENIENT}", line=self._first[0])
 
     def take(self) -> tuple[tuple[str, ...], int, dict[str, int]]:
-        """Return messages, number of faults and counts since the last call, and reset them."""
+        """Return the messages, the number of faults and the counts since the last call."""
         taken = (first_problems(self._messages, count=self._problems), self._problems, self.counts)
         self._messages, self._problems, self.counts = [], 0, {}
         return taken
 
 
-#: Labels of header records that occur among epochs where files were concatenated or edited.
+#: Labels of header records; such records are among the epochs if files were concatenated or edited.
 LABELS: Final = frozenset(
     (
         "COMMENT", "RINEX VERSION / TYPE", "END OF HEADER", "PGM / RUN BY / DATE", "MARKER NAME", "MARKER NUMBER",
@@ -122,7 +122,7 @@ LABELS: Final = frozenset(
         "PRN / # OF OBS",
     )
 )  # fmt: skip
-#: Number of lines that no epoch reaches, because the number of satellites has at most three digits.
+#: Upper limit on the number of lines of an epoch, which has less than 1000 satellites.
 _MAX_LINES = 1100 * 6
 _CUT_EPOCH_LINE = "the file ends in the middle of an epoch, in its first line"
 
@@ -130,9 +130,9 @@ _CUT_EPOCH_LINE = "the file ends in the middle of an epoch, in its first line"
 def find_epochs(
     lines: Lines, *, version: float, lines_per_satellite: int, at_end: bool, log: FaultLog
 ) -> tuple[EpochHeads, int]:
-    """Find the complete epochs and events of a block; return them and the number of lines that were read.
+    """Return the complete epochs and events in a block, and the number of lines that were read.
 
-    Unless `at_end`, the last epoch is left for the next block, because it may be incomplete.
+    The last epoch may be incomplete. It is left for the next block, except at the end of the file (`at_end`).
     """
     if version >= 3.0:
         return _find_marked(lines, version=version, at_end=at_end, log=log)
@@ -183,7 +183,7 @@ def _find_marked(lines: Lines, *, version: float, at_end: bool, log: FaultLog) -
 
 
 def _records_after(lines: Lines, head: EpochHeads, room: Integers, log: FaultLog) -> dict[int, tuple[int, int, int]]:
-    """Return header records that follow the lines of an epoch, as events by the index of the epoch."""
+    """Return the header records that follow an epoch, as events (line, flag, count) by index of the epoch."""
     records: dict[int, tuple[int, int, int]] = {}
     for k in np.flatnonzero((head.flaw == 0) & (room > head.count)).tolist():
         first, end = int(head.line[k] + 1 + head.count[k]), int(head.line[k] + 1 + room[k])
@@ -194,7 +194,7 @@ def _records_after(lines: Lines, head: EpochHeads, room: Integers, log: FaultLog
 
 
 def _counts(records: dict[int, tuple[int, int, int]], epochs: int) -> Integers:
-    """Return the number of lines of header records after each epoch."""
+    """Return the number of header record lines after each epoch."""
     counts = np.zeros(epochs, dtype=np.int64)
     for k, (_, _, count) in records.items():
         counts[k] = count
@@ -202,7 +202,7 @@ def _counts(records: dict[int, tuple[int, int, int]], epochs: int) -> Integers:
 
 
 def _with_events(epochs: EpochHeads, events: list[tuple[int, int, int]]) -> EpochHeads:
-    """Return epochs and events (line, flag, count) in the order of their lines."""
+    """Return epochs and events (line, flag, count) in file order."""
     if not events:
         return epochs
     joined = join_rows([epochs, EpochHeads(*np.array([(*event, 0, 0) for event in events], dtype=np.int64).T)])
@@ -214,12 +214,12 @@ def _label(lines: Lines, line: int) -> str:
 
 
 def _is_record(lines: Lines, line: int) -> bool:
-    """Return whether a line is a header record, recognised by its label."""
+    """Return whether a line has the label of a header record."""
     return lines.length[line] > 60 and _label(lines, line) in LABELS
 
 
 def _find_unmarked(lines: Lines, *, lines_per_satellite: int, at_end: bool, log: FaultLog) -> tuple[EpochHeads, int]:
-    """Find the epoch lines of RINEX 2 by the decimal point of the seconds; other lines have no point in this column."""
+    """Find RINEX 2 epochs. Only epoch lines have a decimal point in the column of the point of the seconds."""
     n = len(lines)
     long = np.flatnonzero(lines.length >= epoch_width(2.0))
     likely = long[lines.data[lines.start[long] + 18] == ord(".")]
@@ -238,7 +238,7 @@ def _find_unmarked(lines: Lines, *, lines_per_satellite: int, at_end: bool, log:
 
 
 class _Walk:
-    """Walk through the records of a RINEX 2 block; consecutive epochs without a gap are one step."""
+    """Walk through the lines of a RINEX 2 block. Consecutive epochs without lines between them are one step."""
 
     def __init__(self, lines: Lines, following: Integers, event: Masks, head: EpochHeads, log: FaultLog) -> None:
         self._lines, self._line, self._following, self._event = lines, head.line, following, event
@@ -249,7 +249,7 @@ class _Walk:
         self._events: list[tuple[int, int, int]] = []
 
     def run(self, stop: int, *, at_end: bool) -> tuple[EpochHeads, int]:
-        """Walk from line 0 to `stop`; the result is as in `find_epochs`."""
+        """Walk from line 0 to `stop`; return the same as `find_epochs`."""
         position = 0
         while position < stop:
             k = int(np.searchsorted(self._line, position))
@@ -263,7 +263,9 @@ class _Walk:
         return _with_events(self._head[self._kept], self._events), position
 
     def _run_of_epochs(self, k: int, stop: int, *, at_end: bool) -> int:
-        """Keep the epochs from the k-th up to a gap or a malformed epoch, and return the line at which to continue."""
+        """Keep the epochs from the k-th to the next gap or malformed epoch; return the line where the walk
+        continues.
+        """
         later = self._breaks[np.searchsorted(self._breaks, k) :]
         last = int(later[0]) if len(later) else len(self._line) - 1
         beyond = int(np.searchsorted(self._line, stop))
@@ -290,7 +292,7 @@ class _Walk:
         return bound
 
     def _other(self, position: int, k: int, *, at_end: bool) -> int:
-        """Handle a line that is not an epoch line: an event without time, or a malformed line."""
+        """Process a line that is not an epoch line: a header record, an event without time, or a malformed line."""
         if _is_record(self._lines, position):
             return self._header_records(position, at_end=at_end)
         event = event_line(self._lines, position)
@@ -313,9 +315,9 @@ class _Walk:
         return int(self._line[k]) if k < len(self._line) else len(self._lines)
 
     def _header_records(self, position: int, *, at_end: bool) -> int:
-        """Store the header records found between epochs as one event, and return the line at which to continue.
+        """Store header records between epochs as one event, and return the line at which the walk continues.
 
-        Records that may continue after the end of the block are left for the next block.
+        Records at the end of the block are left for the next block, where more may follow.
         """
         end = position
         while end < len(self._lines) and _is_record(self._lines, end):

@@ -1,10 +1,9 @@
 """Split text into lines, parse epoch lines, and find the signals of RINEX observation types.
 
-In RINEX 3 and 4, a type contains the signal ("C1C" is the code of "1C"). In RINEX 2, a type contains the band (RINEX
-2.11, table A1; RINEX 3.05, tables 4 to 11). L1, D1 and S1 have the signal of C1 if it is declared, otherwise of P1; L2,
-D2 and S2 have the signal of P2 if it is declared, otherwise of C2. If these codes are not declared, the signals of C1
-and P2 are used. The BeiDou signals 1I and 1Q, and 1X in RINEX 3.02, are read as 2I, 2Q and 2X, because B1 is band 1 in
-RINEX 3.02.
+In RINEX 3 and 4, an observation type names the signal ("C1C" is the code of "1C"). In RINEX 2, a type names only the
+band (RINEX 2.11, table A1; RINEX 3.05, tables 4 to 11). L1, D1 and S1 are assigned to the signal of C1, or to that of
+P1 if only P1 is declared. L2, D2 and S2 are assigned to the signal of P2, or to that of C2 if only C2 is declared. The
+BeiDou signals 1I and 1Q, and 1X in RINEX 3.02, are read as 2I, 2Q and 2X, because RINEX 3.02 names B1 band 1.
 """
 
 from __future__ import annotations
@@ -26,11 +25,11 @@ _ZERO: Final = ord("0")
 class Lines:
     """Lines of a block of text."""
 
-    data: Bytes  #: The text, padded with blanks so that fixed columns may extend beyond the end of a line.
+    data: Bytes  #: Text of the block, followed by blanks, because fixed columns may extend beyond the last line.
     start: Integers  #: Start of each line, shape (n,).
     length: Integers  #: Length of each line without the line end (LF or CR LF), shape (n,).
     stop: Integers  #: Start of the next line, shape (n,).
-    number: Integers  #: 1-based line numbers in the (decompressed) file, shape (n,).
+    number: Integers  #: Line numbers in the decompressed file, from 1; shape (n,).
 
     def __len__(self) -> int:
         return len(self.start)
@@ -41,7 +40,7 @@ class Lines:
         return self.data[first : first + int(self.length[line])].tobytes().decode("latin-1")
 
     def columns(self, lines: Integers, width: int) -> Bytes:
-        """Return the first `width` characters of lines, blank beyond their ends, shape (n, width)."""
+        """Return the first `width` characters of each line, shape (n, width), blank beyond the end of the line."""
         items = np.ndarray((len(self.data) - width + 1,), dtype=f"V{width}", buffer=self.data, strides=(1,))
         text: Bytes = items[self.start[lines]].view(np.uint8).reshape(len(lines), width)
         short = np.flatnonzero(self.length[lines] < width)
@@ -51,12 +50,12 @@ class Lines:
         return text
 
     def __getitem__(self, some: slice) -> Lines:
-        """Select lines of the same text."""
+        """Return some of the lines."""
         return Lines(self.data, self.start[some], self.length[some], self.stop[some], self.number[some])
 
 
 def split_lines(text: bytes, *, first_number: int, keep_blank: bool) -> Lines:
-    """Split a block, followed by `PADDING` blanks, into lines; empty lines are kept with `keep_blank` (RINEX 2)."""
+    """Split a block, which `PADDING` blanks follow, into lines. Empty lines are kept if `keep_blank` (RINEX 2)."""
     data = np.frombuffer(text, dtype=np.uint8)
     end = kernels.reading.line_ends(data)
     start = np.concatenate([np.zeros(min(len(end), 1), dtype=np.int64), end[:-1] + 1])
@@ -76,9 +75,9 @@ class EpochHeads:
 
     line: Integers  #: Index of the epoch line in `Lines`, shape (n,).
     flag: Integers  #: Epoch flag, -1 if it cannot be read; shape (n,).
-    count: Integers  #: Number of satellites or of header records, -1 if it cannot be read; shape (n,).
+    count: Integers  #: Number of satellites or header records, -1 if unreadable; shape (n,).
     time_ns: Integers  #: Time since 1970 in the file's time system [ns], 0 for events; shape (n,).
-    flaw: Integers  #: Index into `FLAWS`, 0 for a valid line; shape (n,).
+    flaw: Integers  #: Fault as an index into `FLAWS`, 0 for a valid line; shape (n,).
 
     def __len__(self) -> int:
         return len(self.line)
@@ -104,12 +103,12 @@ _SHORT, _FLAG, _COUNT, _PLACES = 1, 2, 3, 4
 
 
 def epoch_width(version: float) -> int:
-    """Return the length of an epoch line up to and including the number of satellites [characters]."""
+    """Return the number of characters in an epoch line up to the end of the number of satellites."""
     return 35 if version >= 3.0 else 32
 
 
 def read_epoch_lines(lines: Lines, which: Integers, *, version: float) -> EpochHeads:
-    """Parse epoch lines of RINEX 2 (years of two digits), 3 and 4; events may lack the time."""
+    """Parse epoch lines of RINEX 2 (years of two digits), 3 and 4. An event may have no time."""
     width = epoch_width(version)
     text = np.ascontiguousarray(lines.columns(which, width).T)  # a row for each column of the file
     at = width - 35
@@ -153,7 +152,7 @@ def read_epoch_lines(lines: Lines, which: Integers, *, version: float) -> EpochH
 
 
 def flaw_text(lines: Lines, line: int, flaw: int, *, version: float) -> str:
-    """Describe the flaw of an epoch line."""
+    """Return a description of the fault in an epoch line."""
     width = epoch_width(version)
     text = f"{lines.text(line):<{width}}"
     message = FLAWS[flaw].format(width=width, flag=text[width - 4], count=text[width - 3 : width])
@@ -168,7 +167,7 @@ def _right_aligned(text: Bytes) -> Bytes:
 
 
 def _number(text: Bytes) -> tuple[Integers, Masks]:
-    """Parse right-aligned digits, shape (width, n), and flag valid numbers."""
+    """Parse right-aligned digits, shape (width, n). Return n numbers and whether each is valid."""
     digits = text - np.uint8(_ZERO)
     is_digit, blank = digits <= 9, text == _BLANK
     fine = (is_digit | blank).all(axis=0) & is_digit[-1] & ~(is_digit[:-1] & blank[1:]).any(axis=0)
@@ -176,13 +175,13 @@ def _number(text: Bytes) -> tuple[Integers, Masks]:
 
 
 def _fraction(text: Bytes) -> tuple[Integers, Masks]:
-    """Parse left-aligned decimals, shape (width, n), as a number of units of the last decimal."""
+    """Parse left-aligned decimals, shape (width, n), as integers in units of the last decimal."""
     _, fine = _number(text[::-1])
     return _value(text - np.uint8(_ZERO), text != _BLANK), fine
 
 
 def _value(digits: Bytes, counted: Masks) -> Integers:
-    """Return the numbers that the digits form, shape (n,); a digit that is not `counted` is taken as 0."""
+    """Return the numbers formed by the digits, shape (n,). Digits that are not `counted` are taken as 0."""
     value = np.zeros(digits.shape[1], dtype=np.int64)
     for row, here in zip(digits, counted, strict=True):
         value = 10 * value + np.where(here, row, 0)
@@ -190,7 +189,7 @@ def _value(digits: Bytes, counted: Masks) -> Integers:
 
 
 def event_line(lines: Lines, line: int) -> tuple[int, int] | None:
-    """Return the flag and the count of a RINEX 2 event line without a time; None for other lines."""
+    """Return the flag and the count of a RINEX 2 event line without a time, or None for another line."""
     text = f"{lines.text(line):<32}"
     flag, count = text[28], text[29:32].strip()
     if text[:26].strip() or flag not in "2345" or not count.isdecimal():
@@ -198,11 +197,11 @@ def event_line(lines: Lines, line: int) -> tuple[int, int] | None:
     return int(flag), int(count)
 
 
-SYSTEMS: Final = "CEGIJRS"  #: Constellation letters of RINEX.
-#: Array of `Observations` by the first letter of an observation type.
+SYSTEMS: Final = "CEGIJRS"  #: RINEX constellation letters.
+#: Field of `Observations` by the first letter of the observation type.
 KINDS: Final = {"C": "code_m", "L": "phase_cycles", "D": "doppler_hz", "S": "cn0_dbhz"}
 
-#: Signal of a RINEX 2 code by constellation.
+#: Signals of RINEX 2 codes by constellation.
 _CODES_2: Final[dict[str, dict[str, str]]] = {
     "G": {"C1": "1C", "P1": "1W", "C2": "2X", "P2": "2W", "C5": "5X", "CA": "1C", "CB": "1X", "CC": "2X"},
     "R": {"C1": "1C", "P1": "1P", "C2": "2C", "P2": "2P", "CA": "1C", "CD": "2C"},
@@ -212,23 +211,23 @@ _CODES_2: Final[dict[str, dict[str, str]]] = {
     "S": {"C1": "1C", "C5": "5X", "CA": "1C"},
     "I": {"C5": "5A", "C9": "9A"},
 }
-#: Codes to which a RINEX 2 phase, Doppler or C/N0 may belong, by band; the first declared code is used.
+#: Codes whose signal a RINEX 2 phase, Doppler or C/N0 is assigned to, by band. The first declared code is used.
 _OWNERS_2: Final[dict[str, tuple[str, ...]]] = {"1": ("C1", "P1"), "2": ("P2", "C2")}
 
 
 @dataclass(frozen=True)
 class SignalColumn:
-    """Column of an observation type in satellite lines."""
+    """Column of one observation type in satellite lines."""
 
     index: int  #: Index of the type among the declared types.
     name: str  #: Observation type as declared in the header, such as "C1C".
-    kind: int  #: Index of the array of the type in `KINDS`.
+    kind: int  #: Index in `KINDS` of the array for the type.
     signal: str  #: Signal of the type, such as "1C".
     divisor: float  #: Scale factor by which values are divided (SYS / SCALE FACTOR).
 
 
 def find_signal(name: str, *, system: str, version: float, declared: Sequence[str]) -> str | None:
-    """Return the signal of an observation type ("C1C", "P2"), given all declared types; None for others (X1, T1)."""
+    """Return the signal of the observation type `name` ("C1C", "P2"), or None for other types ("X1", "T1")."""
     if version >= 3.0:
         if name[0] not in KINDS:
             return None
@@ -251,7 +250,7 @@ def find_signal(name: str, *, system: str, version: float, declared: Sequence[st
 def assign_columns(
     declared: Sequence[str], *, system: str, version: float, scale: Mapping[tuple[str, str], float]
 ) -> tuple[SignalColumn, ...]:
-    """Return the columns of a constellation; of several types with the same meaning, only the first is kept."""
+    """Return the columns of a constellation. If several types have the same signal and kind, only the first is kept."""
     columns: dict[tuple[int, str], SignalColumn] = {}
     for index, name in enumerate(declared):
         signal = find_signal(name, system=system, version=version, declared=declared)

@@ -1,4 +1,4 @@
-"""Writer of RINEX 3.04 and 4.02 observation files (tables A2, A3), plain or packed; equal arrays give equal bytes."""
+"""Writer of RINEX 3.04 and 4.02 observation files (tables A2, A3). Equal input gives equal bytes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from railfix.gnss.joined_observations import signals_by_system
 from railfix.gnss.observations import ObservationHeader, Observations
 from railfix.io.rinex.observations_lines import KINDS
 
-RinexVersion = Literal["3.04", "4.02"]  #: Versions that can be written.
+RinexVersion = Literal["3.04", "4.02"]  #: RINEX versions that can be written.
 
 Packing = Literal["plain", "gz", "crx", "crx.gz"]
 
@@ -33,7 +33,7 @@ _CRX_HEADER_BYTES: Final = 162
 
 
 def detect_packing(path: FilePath) -> Packing:
-    """Return the packing that a file name implies: ``front.crx.gz``, ``log.26d``, ``nav.rnx.gz``, ``log.rnx``."""
+    """Return the packing that a file name implies, such as "crx.gz" for ``front.crx.gz`` and "crx" for ``log.26d``."""
     name = Path(path).name
     inner = name.removesuffix(".gz")
     packing = ("crx" if _HATANAKA_NAME.search(inner) else "", "gz" if inner != name else "")
@@ -42,7 +42,7 @@ def detect_packing(path: FilePath) -> Packing:
 
 @contextmanager
 def open_target(path: FilePath, *, packing: Packing | None = None) -> Iterator[IO[bytes]]:
-    """Open a stream to a file, packed as requested or as the file name implies; an error leaves no file.
+    """Open a stream to a file, packed as requested or as the file name implies. No file remains after an error.
 
     Raise ValueError if the packing is unknown, and OutputError if the text cannot be compressed.
     """
@@ -61,7 +61,7 @@ def open_target(path: FilePath, *, packing: Packing | None = None) -> Iterator[I
 
 @contextmanager
 def _hatanaka(path: FilePath, sink: IO[bytes]) -> Iterator[IO[bytes]]:
-    """Open a stream that is compressed into `sink` by `rnx2crx` of the `hatanaka` package."""
+    """Open a stream; `rnx2crx` of the `hatanaka` package compresses its text into `sink`."""
     with (
         hatanaka_program("rnx2crx") as program,
         tempfile.TemporaryFile(prefix="railfix-") as packed,
@@ -73,7 +73,7 @@ def _hatanaka(path: FilePath, sink: IO[bytes]) -> Iterator[IO[bytes]]:
             yield stream
             stream.close()
         except BrokenPipeError:
-            pass  # the program has ended early; the exit code and the messages are checked below
+            pass  # the program ended early; its exit code and messages are checked below
         except BaseException:
             process.kill()
             raise
@@ -89,7 +89,7 @@ def _hatanaka(path: FilePath, sink: IO[bytes]) -> Iterator[IO[bytes]]:
 
 
 def _without_date(head: bytes) -> bytes:
-    """Blank the date of compression in the header of a CRX file."""
+    """Blank the compression date in the header of a CRX file, so that equal input gives equal bytes."""
     lines = head.split(b"\n")
     lines[1] = lines[1][:40] + b" " * 20 + lines[1][60:]
     return b"\n".join(lines)
@@ -99,25 +99,23 @@ PROGRAM = "railfix"
 
 
 def header_line(text: str, label: str) -> str:
-    """Format one header record of 80 columns with its line end; raise ValueError unless `text` is ASCII of at most 60
-    characters.
-    """
+    """Format one header record. Raise ValueError unless `text` has at most 60 characters, all ASCII."""
     if len(text) > 60 or not text.isascii():
         raise ValueError(f"{label}: {text!r} is not ASCII of at most 60 characters")
     return f"{text:<60}{label:<20}\n"
 
 
 def program_line(created: np.datetime64 | None) -> str:
-    """Format PGM / RUN BY / DATE; the date, in UTC, is blank without `created`."""
+    """Format PGM / RUN BY / DATE. The date is `created` (UTC), or blank if `created` is None."""
     date = "" if created is None else f"{created.astype('datetime64[s]').item():%Y%m%d %H%M%S} UTC"
     return header_line(f"{PROGRAM:<20}{'':20}{date:<20}", "PGM / RUN BY / DATE")
 
 
-_BLOCK_EPOCHS: Final = 1024  #: Number of epochs formatted at once.
+_BLOCK_EPOCHS: Final = 1024  #: Number of epochs that are formatted together.
 _EPOCH_WIDTH: Final = 36  #: Number of bytes of an epoch line, including the line end.
 _FIELD_WIDTH: Final = 16  #: Number of bytes of an observation (F14.3, LLI, SSI).
 _BLANK: Final = ord(" ")
-#: ``_FOUR[n]`` is n as four digits.
+#: Four ASCII digits of each number from 0 to 9999.
 _FOUR: Final = (np.arange(10_000)[:, None] // (1000, 100, 10, 1) % 10 + ord("0")).astype(np.uint8)
 
 
@@ -137,17 +135,17 @@ def write_observations(
     Parameters
     ----------
     observations : Observations, or iterable of them
-        A log, or its pieces in order of time. An epoch without observations is written with 0 satellites. NaN is
-        written as blank, and `break_before` as epoch flag 1.
+        Observations of a log, or its pieces in order of time. An epoch without observations is written with 0
+        satellites. NaN is written as blank, and `break_before` as epoch flag 1.
     path : path-like
     packing : {"plain", "gz", "crx", "crx.gz"}, optional
-        By default from the file name: ``.crx`` and ``.26d`` are Hatanaka-compressed, ``.gz`` is gzip.
+        By default, the packing follows from the file name: Hatanaka for ``.crx`` and ``.26d``, gzip for ``.gz``.
     version : {"3.04", "4.02"}
     observables : mapping of str to sequence of str, optional
-        Observation types of each constellation (``{"G": ["C1C", "L1C"]}``). By default C, L, D and S of every signal of
+        Observation types of each constellation (``{"G": ["C1C", "L1C"]}``). Default: C, L, D and S of every signal in
         the first piece.
     header : ObservationHeader, optional
-        Header to write, by default the header of the first piece.
+        Header to write; default: the header of the first piece.
     comments : sequence of str
         Comment lines of at most 60 ASCII characters.
     created : datetime64, optional
@@ -156,8 +154,8 @@ def write_observations(
     Raises
     ------
     ValueError
-        The observations have no epoch, a time tag is finer than 100 ns, a value is too large for F14.3, or a channel
-        has no column.
+        The observations have no epoch, a time tag is NaT or finer than 100 ns, a value is too large for F14.3, or a
+        channel has no observation type.
     OutputError
         The file cannot be written.
     """
@@ -245,11 +243,11 @@ def _glonass_slots(channels: Mapping[str, int]) -> list[str]:
 
 @dataclass(frozen=True)
 class _WrittenRows:
-    """Satellites of one constellation, with the channel of each column."""
+    """Satellites and columns of one constellation, and the channels written in them."""
 
     satellites: tuple[str, ...]
     columns: tuple[str, ...]
-    channel: Indices  #: Channel of each satellite and column, -1 where the satellite has none; shape (S, K).
+    channel: Indices  #: Channel of each satellite and column, -1 where absent; shape (S, K).
 
 
 def _rows(piece: Observations, columns: Mapping[str, Sequence[str]]) -> list[_WrittenRows]:
@@ -280,7 +278,7 @@ def _text_blocks(piece: Observations, columns: Mapping[str, Sequence[str]]) -> I
 
 
 def _satellite_lines(part: Observations, row: _WrittenRows) -> tuple[Bytes, Masks]:
-    """Format the lines of one constellation, shape (T, S, width); return the lines and a mask of the bytes to write."""
+    """Format one constellation's lines, shape (T, S, width); return them and a mask of the bytes to write."""
     epochs, satellites, width = len(part), len(row.satellites), 3 + _FIELD_WIDTH * len(row.columns) + 1
     text = np.full((epochs, satellites, width), _BLANK, dtype=np.uint8)
     text[:, :, :3] = np.array(row.satellites, dtype="S3").view(np.uint8).reshape(satellites, 3)
