@@ -34,7 +34,7 @@ from railfix.tracking import GnssEpochs, Line, RangeEpochs, SensorEpochs, Tracke
 from railfix.tracking.levels import track_with_levels
 from railfix.tracking.result import is_bounded
 
-#: The filter also uses codes rejected for these reasons, because it weights multipath and faults over several epochs.
+#: Rejection reasons that the filter ignores, because it weights multipath and faults over several epochs itself.
 _WEIGHED_BY_FILTER: Final = (
     Reason.FAULT_EXCLUDED
     | Reason.ALONE_ON_ITS_CLOCK

@@ -2,7 +2,7 @@
 
 Each antenna is positioned on its own trajectory, with its own offset from the vehicle. If the two logs are swapped, or
 if the vehicle faces the other way, each position still fits the ranges of its log. The front antenna then appears
-behind the rear antenna, by the distance by which it should be ahead.
+behind the rear antenna instead of ahead of it, at the same distance.
 """
 
 from __future__ import annotations

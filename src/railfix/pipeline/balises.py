@@ -1,8 +1,8 @@
 """Balises and virtual balises: readings as measurements of the filter, and the passing of each balise.
 
 The interval of a passing is the time during which ``|m - s| <= L``, with the arc length m of the balise, the filter's
-position s and the protection level L of that position. Within this interval, the train certainly moves from one side of
-the balise to the other, in either direction of travel.
+position s and the protection level L of that position. If the position error is within L, the train passes the balise
+during this interval, in either direction of travel.
 """
 
 from __future__ import annotations
@@ -125,8 +125,7 @@ class PassingState:
 
     time: Datetimes  #: Time of the last epoch with a position; shape (1,), or (0,) without an epoch.
     values: Floats  #: `_VALUES` of the last epoch with a position; shape (1, 5) or (0, 5).
-    #: Side of each balise on which the train last certainly was: -1 before the balise, 1 beyond it, 0 unknown; shape
-    #: (M,).
+    #: Last known side of each balise on which the train was: -1 before the balise, 1 beyond it, 0 unknown; shape (M,).
     side: Integers
     since: Datetimes  #: Time at which the train left `side`, shape (M,).
     over: Datetimes  #: Time at which the filter's position was last over the balise, shape (M,).
@@ -247,7 +246,7 @@ def _pass(
             continue
 
         def instant(first: float, last: float, k: int = int(row)) -> np.datetime64:
-            """Return the time at which a value is zero between two epochs; the earlier epoch if it is unknown."""
+            """Return the time between two epochs at which a value is zero; the time of the earlier one if unknown."""
             span = float(seconds(time[k] - time[k - 1]))
             known = np.isfinite(first - last) and first != last and span <= _APART_S
             return np.datetime64(time[k - 1] + timedelta(span * first / (first - last) if known else 0.0))

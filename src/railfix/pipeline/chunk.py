@@ -38,5 +38,5 @@ class Chunk:
 
     @property
     def rows(self) -> dict[str, slice]:
-        """Rows of each antenna's epochs."""
+        """Rows of each antenna's epochs in the concatenated arrays."""
         return dict(zip(self.names, self.antennas.parts, strict=True))

@@ -135,8 +135,8 @@ class Config(ScreenSettings):
     #: the check, or dropped as in P1.
     failed_checks: Literal["keep", "drop"] = "keep"
     #: Availability/accuracy threshold: a position whose single-epoch sigma (`Solution.epoch_sigma_m`) exceeds this
-    #: limit is `uncertain`, a failed check. With ``carrier = "float"`` the sigma of the published position is compared
-    #: with the limit. P4 accepts a car length, 20 m; the preset "strict" uses 10 m and drops failed checks.
+    #: limit is `uncertain`, a failed check. With ``carrier`` "float" or "fixed", the sigma of the published position is
+    #: compared instead. P4 accepts a car length, 20 m; the preset "strict" uses 10 m and drops failed checks.
     largest_sigma_m: float = Field(default=20.0, gt=0)
     #: Minimum number of satellites for a position. P1 3.2 uses 3; with 2, positions on curves are ambiguous.
     min_satellites: int = Field(default=3, ge=2)
@@ -161,7 +161,7 @@ class Config(ScreenSettings):
     robust_fit: RobustFitLimits = RobustFitLimits()
     map_offset: MapOffsetLimits = MapOffsetLimits()  #: Test of the map against the 3-D positions of the last minutes.
     interference: InterferenceLimits = InterferenceLimits()  #: Signs of jamming and spoofing.
-    noise: CodeNoise = CodeNoise()  #: Range sigmas, from which the weights follow.
+    noise: CodeNoise = CodeNoise()  #: Range sigmas, which determine the weights.
     #: Files of SBAS messages, or "stream" for messages that the receivers pass on; empty if SBAS is not used. SBAS
     #: corrections replace the models, and satellites without a valid correction are rejected.
     sbas: tuple[Path, ...] | Literal["stream"] = ()
@@ -187,7 +187,7 @@ class Config(ScreenSettings):
     #: in 3-D. It cannot be combined with SBAS.
     integrity_support: Path | None = None
     araim: AraimBudget = AraimBudget()  #: Risk allocation of the ARAIM levels.
-    #: Largest protection level of an available position. P4 uses a car length, 20 m.
+    #: Largest protection level at which a position is available. P4 uses a car length, 20 m.
     alarm_limit_m: float = Field(default=20.0, gt=0, le=1e5)
     #: Chainage intervals in which local faults cannot be bounded, so that the protection level is infinite. ``railfix
     #: error-model`` prints the intervals that it finds.
@@ -206,7 +206,7 @@ class Config(ScreenSettings):
     continuity: ContinuityLimits = ContinuityLimits()  #: Limits of the test of phase changes along the line.
     phase: PhaseLimits = PhaseLimits()  #: Limits of the float and integer ambiguities.
     #: Filter along the track, which combines codes, Dopplers, carrier-phase changes and sensors of this and earlier
-    #: epochs. `railfix run` and `railfix demo` switch it on.
+    #: epochs.
     filter: Literal["track", "off"] = "track"
     #: Measurements of the filter. Satellites provide `code`, `phase` and `doppler`; on-board sensors provide the
     #: others. `feature` is the position of a line feature that the inertial unit and the tachometer detect.

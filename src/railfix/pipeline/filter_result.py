@@ -125,7 +125,7 @@ class AlongTrack(LineCoordinates, NotebookTable):
         return f"<AlongTrack: {self.status_text()}, {time_span_text(self.time)}>"
 
     def status_text(self) -> str:
-        """Return the number of epochs with a bounded position: ``1,890 of 2,000 epochs tracking or coasting``."""
+        """Return the number of bounded positions as text: ``1,890 of 2,000 epochs tracking or coasting``."""
         return f"{int(is_bounded(self.tracked.status).sum()):,} of {plural(self, 'epoch')} tracking or coasting"
 
     def summary(self) -> dict[str, str]:

@@ -58,7 +58,7 @@ _FAILED: Final = np.isin(np.arange(len(Status)), [
     Status.OFF_MAP, Status.INCONSISTENT, Status.MAP_OFFSET, Status.NO_CONVERGENCE,
 ])  # fmt: skip
 _IN_DOUBT: Final = _FAILED | (np.arange(len(Status)) == Status.UNCERTAIN)
-#: For each suspicion: the statuses that it outranks, and the status that replaces them.
+#: For each suspicion: the statuses that it replaces, and the new status.
 _STATUS_BY_CAUSE: Final = (
     (Suspicion.JAMMING_SUSPECTED, np.arange(len(Status)) == Status.OK, Status.JAMMING_SUSPECTED),
     (Suspicion.SPOOFING_SUSPECTED, _UNDER_SPOOFING, Status.SPOOFING_SUSPECTED),
@@ -79,7 +79,7 @@ class InterferenceState:
     motion: MotionSignState = field(default_factory=MotionSignState)
     held: HeldState = field(default_factory=HeldState)
     second: int = -1  #: GPS second of the last checked epoch.
-    broken: bool = False  #: Whether there was a break since the last checked epoch.
+    broken: bool = False  #: Whether the data had a break since the last checked epoch.
     alarm: int = 0  #: Receiver alarms since the last checked epoch.
     latest: Interference | None = None  #: Result at the last checked epoch.
 
@@ -155,8 +155,8 @@ def _find_interference(
 ) -> tuple[Interference, InterferenceState]:
     """Return the interference at selected epochs of one antenna, and the state for the next chunk.
 
-    `cn0` has the C/N0 of the codes, shape (T, K); `gain` the front-end gain; `alarm` the receiver alarms since the
-    previous epoch; `failed` marks positions that failed a check.
+    `cn0` is the C/N0 of the codes, shape (T, K). `gain` is the front-end gain. `alarm` has the receiver alarms since
+    the previous epoch, and `failed` marks positions that failed a check.
     """
     power, power_state = power_signs(inputs.time, inputs.channel, cn0, gain, state.power, limits)
     motion, motion_state = motion_signs(inputs, state.motion, limits, fitted)

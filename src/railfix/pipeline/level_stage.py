@@ -197,7 +197,7 @@ def late_sides(azimuth_deg: Floats, elevation_deg: Floats, heading_deg: Floats, 
 def apply_verdicts(
     protection: ProtectionResult, status: Codes, has: Masks, chainage_m: Floats, config: Config
 ) -> ProtectionResult:
-    """Return the levels with the verdicts on the positions applied.
+    """Apply the verdicts on the positions to the protection levels, and return the levels.
 
     A level is valid at the position where the ranges were linearised. If another position fits the ranges equally well,
     or the ranges place the antenna beyond an end of the map, the level is unavailable. A failed check, or a

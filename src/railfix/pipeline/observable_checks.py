@@ -96,7 +96,7 @@ def check_observables(
 
 
 def rate_factor(observed_mps: Floats, expected_mps: Floats) -> Floats:
-    """Return the ratio of observed to computed satellite rates, shape (T,); NaN where it is unclear.
+    """Return the ratio of observed to computed satellite rates, shape (T,); NaN where it cannot be determined.
 
     The rates of one constellation have shape (T, K); their median over the satellites is subtracted at each epoch. The
     factor is the median of the satellites' ratios.
@@ -125,7 +125,7 @@ def _held(factor: Floats, before: float, chosen: Masks) -> Floats:
 def _phase_rates(
     time: Datetimes, channel: Strings, phase_m: Floats, rate_mps: Floats, state: ObservableState
 ) -> tuple[tuple[Floats, Floats], ObservableState]:
-    """Return phase changes since the previous epoch and mean range rates [m/s], shape (T, K), and the state."""
+    """Return phase rates since the previous epoch and mean range rates [m/s], shape (T, K) each, and the state."""
     if not len(time):
         return (phase_m, rate_mps), state
     joined = join_channels(channel, [state.channel])
@@ -142,8 +142,8 @@ def _phase_rates(
 
 
 def _without(corrected: CorrectedRanges, letters: Strings, bad: dict[int, Masks]) -> CorrectedRanges:
-    """Return the ranges without bad Dopplers (kind 0) or phases (kind 1), on all signals of a bad constellation; `bad`
-    has a mask (T, K) for each bad kind.
+    """Return the ranges without the Dopplers (kind 0) or phases (kind 1) of bad constellations; `bad` has a mask (T, K)
+    for each bad kind.
     """
     obs: Observations = corrected.observations
     of_channel: Indices = (obs.satellite.astype("<U1")[:, None] == letters).astype(np.intp)

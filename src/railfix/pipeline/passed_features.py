@@ -24,7 +24,7 @@ def ahead_m(trajectory: Trajectory) -> float:
 
 @dataclass(frozen=True, kw_only=True)
 class RateSeries:
-    """Changes of the body's heading and pitch, wheel distances and speeds at K ticks."""
+    """Changes of the body's heading and pitch, wheel distances and speeds at K sample times (ticks)."""
 
     time: Datetimes  #: Times at which the rates are valid, shape (K,).
     known: Datetimes  #: Times at which the rates became known, shape (K,).

@@ -213,7 +213,7 @@ def _published(
 
 
 def _nominal_variance_m2(model: LinearModel, nominal_elevation_sigma_m: Floats) -> Floats:
-    """Return the along-line variance by satellite and atmospheric errors that are not in the range sigmas [m^2]."""
+    """Return the along-line variance due to satellite and atmospheric errors that the range sigmas omit [m^2]."""
     share = (
         model.gain_m[..., 0] * model.root_weight * np.where(model.used, np.fmax(nominal_elevation_sigma_m, 0.0), 0.0)
     )

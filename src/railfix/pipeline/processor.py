@@ -76,18 +76,18 @@ class EpochProcessor:
         The files named in the configuration are not read; pass their contents, as
         `railfix.run.processor_setup.make_processor` does.
     trajectories : mapping of str to Trajectory
-        Trajectory of each antenna; the names of the antennas are "front" and "rear".
+        Trajectory of the antenna "front", of the antenna "rear", or of both.
     navigation : Navigation, optional
-        Navigation records known from the start; further records can be passed with each chunk. If they are omitted, the
-        first chunk must include records; otherwise `process` raises `SettingsError`.
+        Navigation records known from the start; further records can be passed with each chunk. If None, records must be
+        passed with the first chunk, otherwise `process` raises `SettingsError`.
     corrections : MessageCorrections, optional
         SBAS corrections (`railfix.ranges.sbas.SbasState`) from the messages known from the start. They are required if
         ``config.sbas`` requests SBAS, and rejected otherwise. Further messages can be passed with each chunk.
     models : Models, optional
     stations : Stations, optional
     screens : sequence of Screen, optional
-        User-defined screens, used with their limits in addition to the screens of `config`. Their verdicts are in
-        `AntennaResult.screens`, but not in the columns of the tables.
+        User-defined screens, which are used with their own limits in addition to the screens of `config`. Their
+        verdicts are in `AntennaResult.screens`, but not in the columns of the tables.
 
     Attributes
     ----------
@@ -230,7 +230,7 @@ class EpochProcessor:
             State after the previous chunk; None at the start of a log.
         navigation : Navigation, optional
             Records received since the previous chunk. If each record is given before the first epoch that uses it, the
-            results equal those with all records given at the start.
+            results are the same as if all records were given at the start.
         messages : SbasMessages, optional
             SBAS messages received since the previous chunk, for processors with `corrections`.
         sensors : SensorSamples, optional

@@ -152,7 +152,7 @@ def receive(
     Repeated and expired records are dropped as well, except for a satellite's newest record. Newer coefficients and
     precise ephemerides replace the older ones. With SBAS, every satellite is rejected until its corrections are
     complete. Raise SettingsError if SBAS is combined with precise ephemerides, if the messages do not match the
-    corrections, or if there are no corrections.
+    corrections, or if messages are given without corrections.
     """
     if navigation is None and messages is None:
         return before

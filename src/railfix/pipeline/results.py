@@ -155,7 +155,7 @@ class AntennaResult(Solution, LineCoordinates, NotebookTable):
         return f"<AntennaResult: {self.status_text()}, {time_span_text(self.time)}>"
 
     def status_text(self) -> str:
-        """Return the number of epochs with the status OK: ``1,827 of 2,000 epochs ok``."""
+        """Return the number of epochs with the status OK as text: ``1,827 of 2,000 epochs ok``."""
         return f"{int((self.status == Status.OK).sum()):,} of {plural(self, 'epoch')} ok"
 
     def summary(self) -> dict[str, str]:

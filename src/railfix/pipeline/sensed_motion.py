@@ -72,9 +72,9 @@ class SensedMotion:
     doubt_mps: Floats  #: Largest slip speed that an undetected slip can have, shape (T,).
     #: Part of the mean forward specific force due to pitching of the body, 0 without a gyro; shape (T,).
     swing_mps2: Floats
-    #: Gradient of the line under the body toward rising arc length, from wheel and accelerometer (P2 2.3); an offset of
-    #: 0.01 m/s2 causes an error of 0.001. The gradient and the next three fields are NaN unless the wheel rolls without
-    #: slip and faster than `SLOWEST_MPS`; shape (T,) each.
+    #: Gradient of the line under the body toward rising arc length, from wheel and accelerometer (P2 2.3); an
+    #: accelerometer offset of 0.01 m/s2 causes an error of 0.001. The gradient and the next three fields are NaN unless
+    #: the wheel rolls without slip and faster than `SLOWEST_MPS`; shape (T,) each.
     gradient: Floats
     curvature_1pm: Floats  #: Curvature from the yaw rate, positive to the right toward rising arc length.
     #: Cant between the wheels' contact points, from the roll of the body; positive if the left rail is higher; NaN

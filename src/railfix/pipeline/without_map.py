@@ -89,7 +89,7 @@ class RangesWithoutMap:
     """Corrected ranges of one antenna at an approximate position, T epochs by K channels."""
 
     corrected: CorrectedRanges
-    #: Ranges to be fitted, with sigmas including satellite and atmospheric errors; weight 0 for the others.
+    #: Ranges with sigmas that include satellite and atmospheric errors; ranges that must not be fitted have weight 0.
     ranges: Ranges
     near_ecef_m: Floats  #: Approximate position; NaN if the codes give none; shape (T, 3).
     no_position: Codes  #: `NoPosition` from the numbers of codes, records and satellites; shape (T,).
@@ -102,7 +102,7 @@ _OF_CODES: Final = int(Reason.NOT_OBSERVED | Reason.IMPLAUSIBLE_CODE | Reason.OT
 def ranges_without_map(obs: Observations, received: Received, config: Config, book: ChannelBook) -> RangesWithoutMap:
     """Return corrected ranges of one antenna without a track, and approximate positions from the codes.
 
-    The ranges are corrected by the delay models and by a received base station, not by SBAS.
+    The ranges are corrected by the delay models and by received base station errors, but not by SBAS.
     """
     channels = book.of(obs, received.navigation)
     source = with_base_station(replace(broadcast_source(received, config), second="none"), received, config)

@@ -23,7 +23,7 @@ from railfix.report.explain import explain_epoch, time_text, write_explanation
 from railfix.report.plots.campaign import campaign_bars, campaign_plan
 from railfix.report.plots.chart import Chart
 
-#: Maximum number of listed epochs.
+#: Maximum number of worst epochs that are listed.
 _WORST: Final = 10
 #: At most one epoch of a run is listed in each interval of this length [s].
 _EVENT_S: Final = 60

@@ -52,7 +52,7 @@ class OpenSkyCn0(Protocol):
         """Return the mean C/N0 of channels at their elevations, shape (T, M) [dB-Hz]; NaN where unknown."""
 
     def notes_for(self, header: ObservationHeader) -> tuple[str, ...]:
-        """Return a sentence for each of antenna and receiver that differs between the log's header and the curve."""
+        """Return one sentence for each difference in antenna or receiver between a log's header and the curve."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -63,8 +63,8 @@ def plan(
 ) -> Chart:
     """Return a plan of the line and the positions of one antenna, with marks of the kilometrage (P1 figure 6).
 
-    Positions are coloured by `error_m` if given, otherwise by `level_m` if given, both of shape (rows,), and otherwise
-    by status. With `filtered`, the positions of the filter are drawn at epochs without a single-epoch position. Without
+    Positions are coloured by `error_m`, by `level_m`, both of shape (rows,), or by status: by the first of these that
+    is given. With `filtered`, the positions of the filter are drawn at epochs without a single-epoch position. Without
     `track`, the line is drawn through the positions. `tunnels_m` has the first and last chainage of each tunnel.
     `background` has lines that are drawn below, each as longitude and latitude of shape (P, 2) [deg]. The chart is
     empty if there is no position.
