@@ -193,10 +193,7 @@ class LiveEngine:
         self._due_ns = now_ns if self._due_ns is None else self._due_ns
 
     def export_state(self, *, reserved: int = 0) -> EngineState:
-        """Return the state for a restarted session.
-
-        `reserved` is added to the sequence number, so that no number is used twice after a crash.
-        """
+        """Return the state for a restarted session, with `reserved` added to the sequence number in case of a crash."""
         sequence = self._sequence + reserved
         if self._saved is not None:  # no epoch has been received yet
             return replace(self._saved, sequence=sequence)
