@@ -1,4 +1,5 @@
-"""Report on all runs of a campaign: lines, errors and protection levels by run, and explained worst epochs."""
+"""Report on all runs of a campaign: lines, errors and protection levels by run, and explanations of the worst
+epochs."""
 
 from __future__ import annotations
 

@@ -226,8 +226,8 @@ class Figure:
     json: Markup  #: Values of the chart for the script of the page.
     width: str  #: Style class of the width: "wide" or "half".
     sky: str  #: Element id of the sky plot that shows the epoch of a clicked point; "" if there is no sky plot.
-    zoomed_with: str  #: Figures with the same text share the range of the x axis; "" if the range is not shared.
-    linked: str  #: Figures with the same text show the same epochs after a zoom; "" for a figure that is not linked.
+    zoomed_with: str  #: Figures with the same value share the range of the x axis; "" if the range is not shared.
+    linked: str  #: Figures with the same value show the same epochs after a zoom; "" for a figure that is not linked.
 
     @property
     def is_sky(self) -> bool:

@@ -88,8 +88,8 @@ class Explanation:
     single: Mapping[str, Any]
     track: Mapping[str, Any]
     #: One row per observation, used observations first, with elevation, residual, outcome, and weight and innovation in
-    #: the filter. Columns `WITHOUT` of a used observation have the shift of the single-epoch position along the line
-    #: and its standard deviation if the observation is omitted [m]; null if there would be no position.
+    #: the filter. Columns `WITHOUT` describe the single-epoch position that results if a used observation is omitted:
+    #: its shift along the line and its standard deviation [m]; null if there is no such position.
     satellites: pl.DataFrame
     sentences: tuple[str, ...]  #: Sentences on position, sigma, protection level and status.
     #: Epochs before and after the explained epoch: columns `_NEIGHBOURS` of ``positions``, and of ``train`` with the

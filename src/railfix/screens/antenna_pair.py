@@ -105,7 +105,7 @@ def spacing_direction(front_ecef_m: ArrayLike, rear_ecef_m: ArrayLike) -> Spacin
     ----------
     front_ecef_m, rear_ecef_m : array_like, shape (P, 3) [m]
         Antenna positions on their trajectories at the same instant. Only the difference of the two positions is used,
-        so that a common error has no effect on a straight line.
+        so that an error of both positions has no effect on a straight line.
     """
     front, rear = np.asarray(front_ecef_m, dtype=np.float64), np.asarray(rear_ecef_m, dtype=np.float64)
     latitude, longitude, _ = geodetic_from_ecef((front + rear) / 2.0)

@@ -31,7 +31,7 @@ from railfix.screens.base import (
 class Cn0Limits(Settings):
     """Limits of the C/N0 screen."""
 
-    #: Largest deficit of C/N0 relative to the open-sky mean at the same elevation; 10 in P1 table 6; None disables it.
+    #: Largest deficit of C/N0 from the open-sky mean at the same elevation; 10 in P1 table 6. None disables the test.
     deficit_dbhz: float | None = Field(default=10.0, gt=0.0, allow_inf_nan=False)
     #: Minimum C/N0; with None, the default, there is no floor. P1 table 6 uses 30 for its receivers. Receivers measure
     #: C/N0 differently: 30 rejects over half of an M8T's signals in a city, where 20 to 25 is suitable.

@@ -50,7 +50,7 @@ class DopplerLimits(Settings):
     short_interval_s: float = Field(default=0.2, gt=0.0, allow_inf_nan=False)
     #: Time over which the receiver smooths its pseudoranges. With 1 s, the fixed limit is 2.9 m at an interval of 1 s.
     correlation_s: float = Field(default=1.0, gt=0.0, allow_inf_nan=False)
-    #: Largest jerk of the vehicle; trains stay below 1 [m/s^3].
+    #: Largest jerk of the vehicle [m/s^3]; trains stay below 1.
     jerk_mps3: float = Field(default=1.0, ge=0.0, allow_inf_nan=False)
     #: Limit in standard deviations, for modes "receiver" and "sigma".
     factor: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
