@@ -1,5 +1,4 @@
-"""Report on all runs of a campaign: lines, errors and protection levels by run, and explanations of the worst
-epochs."""
+"""Report on all runs of a campaign: lines, errors and protection levels by run, and explanations of worst epochs."""
 
 from __future__ import annotations
 
