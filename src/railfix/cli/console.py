@@ -50,13 +50,15 @@ def print_json(values: Mapping[str, Any]) -> None:
 def list_antenna_errors(evaluation: Evaluation) -> list[dict[str, Any]]:
     """Return the error statistics of the positions on the map over all epochs, one row per run and antenna.
 
-    Rows without errors come first; the other rows are in descending order of the 95th percentile.
+    Rows of the filter come before rows of single epochs. Among them, rows without errors come first, and the other rows
+    are in descending order of the 95th percentile.
     """
     rows = evaluation.figures.filter(
         pl.col("grouping") == "all", pl.col("epochs_of") == "own", pl.col("position") == "constrained",
         pl.col("run") != "all", pl.col("antenna") != "all",
-    ).sort("p95_m", descending=True, nulls_last=False)  # fmt: skip
-    return rows.to_dicts()
+    )  # fmt: skip
+    by_filter = pl.col("run").str.ends_with("(train)")
+    return rows.sort(by_filter, "p95_m", descending=True, nulls_last=False).to_dicts()
 
 
 def verdict_of_evaluation(evaluation: Evaluation) -> list[str]:
@@ -67,7 +69,7 @@ def verdict_of_evaluation(evaluation: Evaluation) -> list[str]:
     room = _MOST - 1
     texts = [_judge(row) for row in list_antenna_errors(evaluation)]
     if len(texts) > room:
-        texts = [*texts[: room - 1], f"and {len(texts) - room + 1} more with smaller errors: see the tables below"]
+        texts = [*texts[: room - 1], f"and {len(texts) - room + 1} more: see the tables below"]
     paths, references = ({str(getattr(run, what)) for run in evaluation.runs} for what in ("path", "reference"))
     if len(paths) == len(references) == 1:
         run, reference = shlex.quote(paths.pop()), shlex.quote(references.pop())
@@ -115,7 +117,7 @@ def _judge(row: Mapping[str, Any]) -> str:
     )
     if row["max_at_chainage_m"] is not None:
         text += f" at chainage {row['max_at_chainage_m']:.0f} m"
-    text += f"; {row['wrong_places']:,} wrong positions (error over {WRONG_PLACE_M:g} m)"
+    text += f"; {plural(row['wrong_places'], 'wrong position')} (error over {WRONG_PLACE_M:g} m)"
     ratio = row["normalised_p95"]
     if ratio is not None:
         true = "fits" if ratio <= _OVERCONFIDENT else "is too small for"

@@ -22,6 +22,7 @@ from railfix.cli.options import (
     JsonOption,
     OutOption,
     OverwriteOption,
+    VerboseOption,
     Without,
     check_outputs,
     from_models,
@@ -54,11 +55,16 @@ if TYPE_CHECKING:
 
 #: Maximum number of printed rows of the table by section.
 _MOST_SECTIONS: Final = 20
+#: Beginnings of the names of the tables that are printed without ``--verbose``.
+_MAIN_TABLES: Final = ("figures-of-merit", "figures-by-configuration", "levels", "above-level")
 _MOST_BEYOND: Final = 5  #: Maximum number of printed epochs with an error above the protection level.
 
 
-def show_evaluation(evaluation: Evaluation, files: dict[str, Path]) -> None:
-    """Print the verdict, the references of each run, the tables of errors and levels, and the written files."""
+def show_evaluation(evaluation: Evaluation, files: dict[str, Path], *, verbose: bool) -> None:
+    """Print the verdict, the references of each run, the tables, and the paths of the written files.
+
+    Without `verbose`, only the tables in `_MAIN_TABLES` are printed, and with alarm limits also the Stanford counts.
+    """
     console = TableConsole()
     show_verdict(console, verdict_of_evaluation(evaluation))
     for run in evaluation.runs:
@@ -68,14 +74,17 @@ def show_evaluation(evaluation: Evaluation, files: dict[str, Path]) -> None:
             outside = plural(run.outside[antenna], "epoch")
             console.print(f"  {antenna}: against {run.reference}, {by}; {outside} outside the reference")
         show_notes(console, run.notes)
-    for table in error_tables(evaluation):
-        show_table(console, table)
-    for text in dict.fromkeys(prior_basis_text(run.protection) for run in evaluation.runs if run.protection):
-        console.print(f"Protection levels: {text}")
-    for table in level_tables(evaluation, worst=_MOST_BEYOND):
-        show_table(console, table)
-    for table in group_tables(evaluation):
-        show_table(console, table, most=_MOST_SECTIONS)
+    levels, groups = level_tables(evaluation, worst=_MOST_BEYOND), group_tables(evaluation)
+    tables = [*error_tables(evaluation), *levels, *groups]
+    main = (*_MAIN_TABLES, "stanford") if evaluation.options.alarm_limits_m else _MAIN_TABLES
+    shown = [table for table in tables if verbose or table.name.startswith(main)]
+    for table in shown:
+        if table in levels[:1]:
+            for text in dict.fromkeys(prior_basis_text(run.protection) for run in evaluation.runs if run.protection):
+                console.print(f"Protection levels: {text}")
+        show_table(console, table, most=_MOST_SECTIONS if table in groups else None)
+    if len(shown) < len(tables):
+        console.print(f"{plural(len(tables) - len(shown), 'more table')}: --verbose prints all tables")
     show_files(console, files.values())
 
 
@@ -93,6 +102,7 @@ def evaluate(
     files: Annotated[TrackFiles, Without("reference", "map_epoch", "plate", "jgd_parameters", "height_sigma")],
     options: EvaluationOptions,
     overwrite: OverwriteOption = False,
+    verbose: VerboseOption = False,
     as_json: JsonOption = False,
 ) -> None:
     r"""Compute the along-track errors of runs against references, and statistics of these errors.
@@ -139,7 +149,7 @@ def evaluate(
         notes = [note for run in evaluation.runs for note in run.notes]
         print_json({"antennas": list_antenna_errors(evaluation), "notes": notes, "files": list(written.values())})
     else:
-        show_evaluation(evaluation, written)
+        show_evaluation(evaluation, written, verbose=verbose)
 
 
 def _pair(runs: list[Path], reference: tuple[str, ...], label: tuple[str, ...]) -> list[RunAndReference]:

@@ -37,7 +37,7 @@ OverwriteOption = Annotated[
 ]
 VerboseOption = Annotated[
     bool,
-    typer.Option("--verbose", rich_help_panel="Choices", help="Print all notes and tables of statuses and reasons."),
+    typer.Option("--verbose", rich_help_panel="Choices", help="Print all notes and tables."),
 ]
 JsonOption = Annotated[
     bool, typer.Option("--json", rich_help_panel="Choices", help="Print the results as one line of JSON.")
