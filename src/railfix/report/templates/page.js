@@ -352,7 +352,7 @@
     const used = order.filter(i => data.reason[i] === 0).length, moment = this.time(k);
     let text = `${date(moment)} ${clock(moment)}: ${used} signals used, ${order.length - used} rejected`;
     if (this.chosen !== null && Math.abs(this.chosen - moment) > 0.05)
-      text = `this page has no observations of ${clock(this.chosen)}; the nearest epoch with observations: ${text}`;
+      text = `this page has no observations at ${clock(this.chosen)}; the nearest epoch with observations: ${text}`;
     this.said.textContent = text;
     const cn0 = i => data.cn0[i] === 65535 ? NaN : data.cn0[i] / 100;
     this.picture.replaceChildren(...skyMarks(order.map(i => ({ name: data.names[data.satellite[i]], azimuth: data.azimuth[i] / 100,
