@@ -1,8 +1,8 @@
 """railfix: satellite train positioning on a 3-D track map.
 
 A train runs on a known line. The train's antenna therefore lies on a known 3-D curve, and its position is one
-coordinate along this curve. railfix turns raw receiver logs (RINEX) and a track map into positions along the line, with
-the reason for every rejected observation.
+coordinate along this curve. railfix turns raw receiver logs (RINEX) and a track map into positions along the line, and
+states the reason for every rejected observation.
 
 Where to begin
 --------------

@@ -50,8 +50,8 @@ def print_json(values: Mapping[str, Any]) -> None:
 def list_antenna_errors(evaluation: Evaluation) -> list[dict[str, Any]]:
     """Return the error statistics of the positions on the map over all epochs, one row per run and antenna.
 
-    Rows of the filter come before rows of single epochs. Among them, rows without errors come first, and the other rows
-    are in descending order of the 95th percentile.
+    Rows of the filter come before rows of single epochs. In both groups, rows without errors come first, and the other
+    rows are in descending order of the 95th percentile of the error.
     """
     rows = evaluation.figures.filter(
         pl.col("grouping") == "all", pl.col("epochs_of") == "own", pl.col("position") == "constrained",
@@ -62,7 +62,7 @@ def list_antenna_errors(evaluation: Evaluation) -> list[dict[str, Any]]:
 
 
 def verdict_of_evaluation(evaluation: Evaluation) -> list[str]:
-    """Return at most `_MOST` lines: accuracy per run and antenna, largest errors first, and the command to use next.
+    """Return at most `_MOST` lines: the accuracy of each run and antenna, largest errors first, then the next command.
 
     Each line on accuracy also reports whether the stated sigma fits the errors.
     """

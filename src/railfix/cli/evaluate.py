@@ -110,7 +110,7 @@ def evaluate(
     The error is the distance along the line from the reference to the position, positive toward the end of the line in
     either direction of travel. The tables have three kinds of positions: the positions on the map, the positions with
     status ok, and the conventional positions (3-D single point, moved to the nearest point of the line). The statistics
-    are given over the epochs of each kind, and over the epochs that all kinds have. Errors are grouped by antenna,
+    are computed over the epochs of each kind, and over the epochs that all kinds have. Errors are grouped by antenna,
     section, environment, speed, number of satellites used, presence of satellites, and status. With several runs, they
     are also grouped by configuration and line.
 
@@ -183,7 +183,7 @@ def reference(
     A position is rejected if it is not an RTK fix, has a low ambiguity ratio, is too far from the antenna's trajectory,
     disagrees with the distance travelled, or disagrees with the distance between the two antennas. The remaining
     positions are matched to the trajectory. The gaps between these positions are bridged with Doppler speeds,
-    tachometer pulses and accelerations, as far as they are given, each weighted by its inverse variance. The closing
+    tachometer pulses and accelerations, as far as they are available, weighted by their inverse variances. The closing
     error of a gap is distributed over the gap. The following files are written into DIR:
 
     - `reference.csv`: one row per instant and antenna; position, speed, standard deviation, source `rtk` or `bridged`
@@ -243,8 +243,8 @@ def error_model(
     and atmospheric errors of the recorded days; it is then wider, and valid only for days with similar errors.
 
     The file has the bias, the standard deviation and a Gaussian overbound for every bin of elevation, C/N0, and azimuth
-    relative to the front of the car. Each is given before and after the screens. `railfix run --error-model MODEL.toml`
-    derives the protection level from the model.
+    relative to the front of the car. All three are stated before and after the screens. `railfix run --error-model
+    MODEL.toml` derives the protection level from the model.
 
     Example: `railfix error-model results --reference reference.csv --base 0759.obs --out line.toml`
 

@@ -211,10 +211,10 @@ def keys(
     """Make keys and certificates for a control centre and trains, add trains, and renew certificates.
 
     A certificate authority signs the certificates; the key of the authority (authority.key) must stay in DIR. Copy
-    authority.pem to the centre and to each train, and the key and certificate of the centre or train to its owner. If
-    DIR already has a certificate authority, trains are added. The serial number of each certificate is printed; to
-    revoke a certificate, write its serial number into revoked.txt in the centre's folder. Key files are readable only
-    by the user who made them.
+    authority.pem to the centre and to each train; also copy each key and its certificate to the centre or train that
+    they are made for. If DIR already has a certificate authority, trains are added. The serial number of each
+    certificate is printed; to revoke a certificate, write its serial number into revoked.txt in the centre's folder.
+    Key files are readable only by the user who made them.
 
     Example: `railfix ground keys keys --train 1 --train 2`
 

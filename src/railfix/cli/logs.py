@@ -194,7 +194,7 @@ def export(
 
     The extension of FILE selects the format. Each position has the time, antenna, status, chainage, standard deviation,
     protection level, speed and track, as far as the run has them; an infinite protection level is left empty. Epochs
-    without a position are left out. Coordinates are WGS 84 with ellipsoidal heights.
+    without a position are omitted. Coordinates are WGS 84 with ellipsoidal heights.
 
     With GeoJSON, GeoPackage and GeoParquet files, a style file of the same name (`.qml`) is written, with which QGIS
     colours the positions by status. MCAP files have every column of the run.

@@ -125,10 +125,10 @@ def features(
 ) -> None:
     """List the features of a line, which are the positions at which the gradient or the curvature changes.
 
-    A train that measures such a change can determine its position from it (`railfix.motion.features`). Changes are
-    computed over 15 m, which is about the distance between two bogies. With `--run`, the features are the changes that
-    several runs measured consistently. Each feature then has the number of runs that measured it, the standard
-    deviation of the measured positions (as in P2's table 1), and the distance from the same feature in the map.
+    A train can determine its position by measuring such a change (`railfix.motion.features`). Changes are computed over
+    15 m, which is about the distance between two bogies. With `--run`, the features are the changes that several runs
+    measured consistently. Each feature then has the number of runs that measured it, the standard deviation of the
+    measured positions (as in P2's table 1), and the distance from the same feature in the map.
 
     Example:
 
@@ -218,7 +218,7 @@ def from_positions_command(
 
     Positions without an accepted quality number and positions at standstill are omitted. The other positions are
     thinned to the spacing; the chord between two points deviates by at most 0.30 m from the omitted positions. The map
-    is the path of the antenna: use it without a vehicle file. A run over several laps gives a map with several laps.
+    is the path of the antenna: use it without a vehicle file. A run over several laps yields a map with several laps.
 
     Example: `railfix map from-positions rtk.pos --out line.csv --quality 1`
 

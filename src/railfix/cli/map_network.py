@@ -174,7 +174,7 @@ def route(
 ) -> None:
     """Make the track map of one route from a network or another map file.
 
-    The route is given by tracks or by points on the route, or is found from the positions of a run.
+    The route is specified by tracks or by points on the route, or is found from the positions of a run.
 
     Example: `railfix map route net.gpkg --positions run.pos --heights run.pos --out route.csv`
 
@@ -257,8 +257,8 @@ def match_command(
 ) -> None:
     """Match positions to the tracks of a network.
 
-    For each position, the track, the chainage on the track, the probability and the second most probable track are
-    written.
+    The output has, for each position, the track, the chainage on it, its probability, and the second most probable
+    track.
 
     Rows without a position that lie between known positions are filled along the shortest route; `filled_bound_m`
     bounds the error of a filled row. The positions are transformed to the reference frame of the map at the epoch of

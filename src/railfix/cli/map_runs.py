@@ -51,7 +51,7 @@ def service(
     limit: Annotated[float, typer.Option(metavar="M", help="Alarm limit for the protection level.")] = 20.0,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Report by chainage: numbers of satellites, signs of reflections, fractions of ok epochs, protection levels.
+    """Report numbers of satellites, indications of reflected signals, and protection levels by chainage.
 
     The distance of the 3-D position from the line indicates reflected signals, because the 3-D position is computed
     without the map. Several runs at different times of the day are more representative than one run.

@@ -29,8 +29,7 @@ _SATELLITES: Final[Sequence[Column]] = (
     ("residual m", "residual_m", partial(digits, 2)), ("without it m", "without_shift_m", partial(digits, 2)),
     ("sigma then m", "without_sigma_m", partial(digits, 2)), ("outcome", "reason_text", str),
 )  # fmt: skip
-#: Parameter ``M_MMAP_THRESHOLD`` of ``malloc.h``, and the threshold: memory of arrays above this size [bytes] is mapped
-#: separately.
+#: Parameter ``M_MMAP_THRESHOLD`` of ``malloc.h``, and its value: larger arrays [bytes] have memory of their own.
 _THRESHOLD: Final = (-3, 1 << 17)
 
 
@@ -66,17 +65,17 @@ def report(
     """Write one HTML page on one or several runs, to open in a browser.
 
     The page begins with one sentence, five key figures, the plan of the line coloured by error, and the error over
-    chainage compared with the conventional error. Folded sections follow, with figures of merit, counts, protection
-    levels, settings and inputs; each table can be downloaded as CSV. The charts of each antenna show errors, protection
-    levels, intervals and, with `railfix run --observations`, sky, C/N0 and screens. Omitted parts are listed with the
-    reasons. Errors are shown only with `--reference`.
+    chainage compared with the error of conventional positions. Folded sections follow, with figures of merit, counts,
+    protection levels, settings and inputs; each table can be downloaded as CSV. The charts of each antenna show errors,
+    protection levels, intervals and, with `railfix run --observations`, sky, C/N0 and screens. Omitted parts are listed
+    with the reasons. Errors are shown only with `--reference`.
 
     The page needs no other files and no network, and can be sent and printed.
 
     Example: `railfix report results --reference truth.csv --out report.html`
 
-    Exit codes are listed in `railfix --help`; the code is 4 if the number of references does not match the runs, 5
-    if a reference covers another time.
+    Exit codes are listed in `railfix --help`; the code is 4 if the number of references does not match the runs, 5 if a
+    reference does not cover the time of its run.
     """
     in_runs = [
         path
@@ -120,8 +119,7 @@ def explain(
     html: Annotated[Path | None, typer.Option(metavar="HTML", help="Page to write, which also has a sky plot.")] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Explain an epoch: position, use or rejection of every satellite, and causes of sigma, protection level and
-    status.
+    """Explain an epoch: position, use of every satellite, parts of sigma and protection level, reason for the status.
 
     For each used satellite, the table has the distance by which the single-epoch position would move along the line if
     this satellite were omitted. The epoch nearest to TIME is explained; it may be at most one minute away.

@@ -137,7 +137,7 @@ def _simulate(
 
 
 def _choose_runs(recipe: Recipe, only: tuple[str, ...]) -> list[int]:
-    """Return the indices of the runs to simulate, from 0, in rising order.
+    """Return the indices (from 0) of the runs to simulate, in ascending order.
 
     Raise SettingsError if a run does not exist.
     """

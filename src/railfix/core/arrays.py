@@ -21,7 +21,7 @@ Integers = NDArray[np.int64]  #: Counts and identifiers.
 Indices = NDArray[np.intp]  #: Indices into another array.
 Codes = NDArray[np.int8]  #: Members of an `IntEnum`, for example `railfix.core.reasons.Status`.
 Bits = NDArray[np.int64]  #: Members of an `IntFlag`, for example `railfix.core.reasons.Reason`.
-Masks = NDArray[np.bool_]  #: Conditions; True in a reject mask means rejected.
+Masks = NDArray[np.bool_]  #: Conditions; True in a rejection mask means rejected.
 Datetimes = NDArray[np.datetime64]  #: GPS times; NaT where absent.
 Bytes = NDArray[np.uint8]  #: Raw bytes of a file.
 Strings = NDArray[np.str_]  #: Names, for example of satellites.
@@ -53,7 +53,7 @@ def kernel_array(array: NDArray[Any]) -> Floats:
 
 
 def freeze_arrays(instance: DataclassInstance) -> None:
-    """Replace the array fields of a dataclass by read-only views; called in its `__post_init__`."""
+    """Replace the array fields of a dataclass by read-only views; to be called in `__post_init__`."""
     vars(instance).update({n: read_only(v) for n, v in vars(instance).items() if isinstance(v, np.ndarray)})
 
 
@@ -106,7 +106,7 @@ def join_rows(parts: Sequence[Rows]) -> Rows:
 def patch_rows(result: Rows, rows: Indices, part: Rows) -> Rows:
     """Return a copy of a dataclass of arrays in which the rows at given indices are replaced by the rows of `part`.
 
-    Every field is an array with the rows on axis 0.
+    Every field must be an array with the rows on axis 0.
     """
     values = {}
     for item in fields(result):

@@ -24,7 +24,7 @@ _CRC24: Final = _crc24_table()
 def crc24q(data: Bytes, start: Indices, end: Indices) -> Integers:
     """Compute the CRC-24Q of N byte ranges of a buffer, from `start` up to but excluding `end`, shape (N,)."""
     crc = np.zeros(len(start), dtype=np.int64)
-    order = np.argsort(start - end, kind="stable")  # longest first, so that the unfinished ranges are a prefix
+    order = np.argsort(start - end, kind="stable")  # longest first, so that unfinished ranges come first
     first, length = start[order], (end - start)[order]
     state = np.zeros(len(start), dtype=np.int64)
     running = len(start)

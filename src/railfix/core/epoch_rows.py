@@ -80,7 +80,7 @@ def _take_epochs(value: Any, rows: slice | Indices) -> Any:
     own, members = value.__dict__, dict[str, Any]()
     if isinstance(value, OnDemand):
         members = {n: item[rows] for n, item in own.items() if item.__class__ is np.ndarray and has_rows[n]}
-        for name in _defaults(cast(Any, value.__class__)):  # with a default, a field would seem evaluated before it is
+        for name in _defaults(cast(Any, value.__class__)):  # a default would make the field seem evaluated
             members[name] = _take_epochs(own[name], rows)
         members["_later"] = lambda n: _take_epochs(getattr(value, n), rows) if has_rows[n] else getattr(value, n)
         return _make(type(value), members)

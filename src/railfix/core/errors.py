@@ -28,7 +28,7 @@ from typing import ClassVar, Final
 
 
 class RailfixError(Exception):
-    """Base of all errors that a user can correct: input files, settings, outputs."""
+    """Base of all errors that a user can correct, in input files, settings or outputs."""
 
     exit_code: ClassVar[int] = 1  #: Exit code of the command line for this class of error.
 

@@ -125,7 +125,7 @@ class _HatanakaStream(ByteStream):
 
 
 def path_names(paths: Paths) -> list[str]:
-    """Return one or several paths as a list of strings; raise SettingsError if there is no path or a wrong type."""
+    """Return the given paths as a list of strings; raise SettingsError if there is none, or an item is not a path."""
     names = list(paths) if isinstance(paths, Iterable) and not isinstance(paths, str) else [paths]
     if not names:
         raise SettingsError("no file was given")
@@ -180,8 +180,8 @@ def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -
 def unpacked_file(path: FilePath) -> Iterator[Path]:
     """Yield the path of a file with the decompressed content, for programs that open files themselves.
 
-    For a file that is not compressed, this is the given path. All files of a zip archive are extracted into one folder.
-    The temporary files are removed at the end of the block.
+    For a file that is not compressed, the given path is returned. All files of a zip archive are extracted into one
+    folder. The temporary files are removed at the end of the block.
     """
     with _open_plain(path) as source:
         head = source.read(_HEAD_BYTES)
@@ -372,7 +372,7 @@ def source_commit() -> str:
 
 
 def read_commit(root: Path) -> str:
-    """Read the commit checked out in a folder (also an additional work tree) from git's files; "" if there is none."""
+    """Read the commit checked out in a folder, or in an additional work tree, from git's files; "" if there is none."""
     git = root / ".git"
     if git.is_file():
         git = root / git.read_text(encoding="utf-8").removeprefix("gitdir:").strip()

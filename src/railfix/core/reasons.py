@@ -51,7 +51,7 @@ class Reason(IntFlag):
     CN0_CURVE = 1 << 16
     #: The change of the pseudorange disagrees with the Doppler.
     DOPPLER = 1 << 17
-    #: The pseudorange difference between the two antennas disagrees with their spacing.
+    #: The pseudorange difference between the two antennas disagrees with the antenna spacing.
     ANTENNA_PAIR = 1 << 18
     #: Excluded by RAIM: the estimated error of the range exceeds the limit.
     FAULT_EXCLUDED = 1 << 19
@@ -88,14 +88,14 @@ class Status(IntEnum):
     ANTENNAS_DISAGREE = 8
     #: A position, but its single-epoch sigma exceeds `Config.largest_sigma_m`.
     UNCERTAIN = 9
-    #: A position, but the 3-D positions of the last minutes lie off the line: the map is wrong here, or the
-    #: train is on another track.
+    #: A position, but the 3-D positions of the last minutes are off the line: the map is wrong here, or the train is on
+    #: another track.
     MAP_OFFSET = 10
     #: A position that passed every check, but jamming of the signals is suspected.
     JAMMING_SUSPECTED = 11
     #: A position, but the signals may be from a spoofer, so that the position error has no bound.
     SPOOFING_SUSPECTED = 12
-    #: A position that was moved to an end of the map, because it was beyond that end, but within the noise.
+    #: A position that was moved to an end of the map, because it was beyond that end by no more than the noise.
     MAP_END = 13
 
     @property

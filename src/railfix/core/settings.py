@@ -55,7 +55,7 @@ class Checked(BaseModel):
             raise SettingsError(f"{type(self).__name__} cannot be changed; replaced() returns a copy with other values")
 
     def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
-        """Yield the settings that differ from their defaults; some defaults are computed from earlier settings."""
+        """Yield the settings that differ from their defaults, which may depend on earlier settings."""
         values = {name: getattr(self, name) for name in type(self).model_fields}
         for name, field in type(self).model_fields.items():
             value = values[name]
@@ -97,7 +97,7 @@ class Settings(Checked):
 
 
 def is_number(kind: Any) -> bool:
-    """Return whether a field has a numeric type, or is either numeric or None; booleans do not count as numbers."""
+    """Return whether a type is numeric, or numeric or None; bool does not count as numeric."""
     parts = [get_args(part)[0] if get_origin(part) is Annotated else part for part in (kind, *get_args(kind))]
     return bool not in parts and (int in parts or float in parts)
 
@@ -147,7 +147,7 @@ def _in_groups(model: type[BaseModel], name: str) -> list[str]:
 
 
 def _fields_at(model: type[BaseModel], location: tuple[int | str, ...]) -> set[str]:
-    """Return the names of the settings in the group at a location of a nested model; empty if it is not a group."""
+    """Return the names of the settings in the group at a location of a nested model; empty if there is no group."""
     kind: Any = model
     for part in location:
         if get_origin(kind) is dict:

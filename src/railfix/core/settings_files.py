@@ -51,7 +51,7 @@ def read_model_file(model: type[ModelFile], path: FilePath, *, what: str, format
     """Read a TOML model file whose entry `format` is `format_name`.
 
     Raise InputFileError if the file is of another format or version, or has an invalid entry. `what` names the kind of
-    file, and `command` the command that creates it.
+    file, and `command` names the command that creates such files.
     """
     values = read_toml(path, what=what)
     written = values.get("format")

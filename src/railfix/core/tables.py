@@ -76,7 +76,7 @@ class Table:
 def plain_table(
     head: Sequence[str], rows: Sequence[Sequence[str]], caption: str = "", *, texts: int = 1, boxed: bool = False
 ) -> Table:
-    """Return a table without a name, for the terminal; all columns except the first `texts` contain numbers."""
+    """Return a table without a name, for the terminal; the first `texts` columns contain text, the others numbers."""
     return Table(name="", head=head, rows=rows, caption=caption, numeric=range(texts, len(head)), boxed=boxed)
 
 

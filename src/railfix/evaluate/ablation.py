@@ -113,7 +113,7 @@ def choices(screens: Sequence[str]) -> dict[str, tuple[str, ...]]:
 
 
 def filter_choices(inputs: RunInputs, sources: Sequence[FilterSource]) -> dict[str, tuple[FilterSource, ...]]:
-    """Return the choices of filter sources by name: all available sources, and all except one; none lacks the codes."""
+    """Return the choices of filter sources by name: all, and all except one; every choice includes the codes."""
     absent = [source for source, names in _SENSORS.items() if any(getattr(inputs, name) is None for name in names)]
     there = tuple(source for source in sources if source not in absent)
     return {FILTER: there} | {
@@ -122,7 +122,7 @@ def filter_choices(inputs: RunInputs, sources: Sequence[FilterSource]) -> dict[s
 
 
 def judging_screens(config: Config, trajectories: Mapping[str, Trajectory]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the active screens whose inputs this run has, and a note on each active screen that is left out."""
+    """Return the active screens whose inputs this run has, and a note on each active screen that is omitted."""
     setup = ScreenSetup(
         antennas=len(trajectories),
         spacing_known=all(t.body_chainage_m is not None for t in trajectories.values()),

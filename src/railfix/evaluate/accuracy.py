@@ -70,7 +70,7 @@ FEWEST_BLOCKS: Final = 5
 _NODES: Final = 400
 
 
-#: Column names of the statistics that have confidence limits, with {} for "_low", "_high" or no ending. The last two
+#: Column names of the statistics that have confidence limits; {} is replaced by "_low", "_high" or "". The last two
 #: statistics are percentiles of |error| / sigma.
 LIMITS: Final = ("mean{}_m", "rate{}", "p95{}_m", "normalised_p68{}", "normalised_p95{}")
 LIMIT_COLUMNS: Final = tuple(name.format(end) for name in LIMITS for end in ("_low", "_high"))

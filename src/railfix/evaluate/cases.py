@@ -76,7 +76,7 @@ class Case:
     folder: Path
     content: CaseFile
     inputs: RunInputs  #: Inputs of the run, without the ground truth.
-    truth: Path  #: Ground truth.
+    truth: Path  #: Path of the ground truth.
 
     def check_hashes(self) -> None:
         """Raise InputFileError if a file is missing or has another SHA-256, SettingsError if no SHA-256 is stated."""

@@ -299,7 +299,7 @@ def reference_beside(run: RunFolder) -> Path:
 
 
 def configurations(settings: Sequence[Mapping[str, Any]], given: Sequence[str]) -> list[str]:
-    """Return a name for the settings of each run: the given label, or the preset and the settings that differ by run.
+    """Return a name for the settings of each run: the given label, or the preset and the settings that differ.
 
     The name of a single run consists of the preset and the screens.
     """

@@ -97,13 +97,13 @@ class RunFolder(RunRecord):
 
     @property
     def protection(self) -> Mapping[str, Any]:
-        """Assumptions of the protection levels; empty if the run has no levels."""
+        """Assumptions of the protection levels; empty if the run has no protection levels."""
         assumptions = self.record.get("protection")
         return assumptions if isinstance(assumptions, Mapping) else {}
 
     @property
     def level_kind(self) -> str | None:
-        """Kind of the protection levels; `UNKNOWN_KIND` if it is not recorded, None if the run has no levels.
+        """Kind of the protection levels; `UNKNOWN_KIND` if it is not recorded, None if there are no protection levels.
 
         Raise InputFileError if positions and ``run.json`` state different kinds.
         """

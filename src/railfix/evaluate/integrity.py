@@ -1,8 +1,8 @@
 """Comparison of protection levels with errors: Stanford counts, availability, continuity, errors above the level.
 
 Epochs are counted with two choices of protection levels. `usable`: a level is used if the status of the position is ok
-(of the filter: tracking or coasting) and the level raises no alarm; any other position is given an infinite level.
-`all`: every level is used, whatever its status.
+(of the filter: tracking or coasting) and the level raises no alarm; any other position has an infinite level. `all`:
+every level is used, whatever its status.
 """
 
 from __future__ import annotations
@@ -183,7 +183,7 @@ def _sort(
 def judge_levels(epochs: pl.DataFrame, runs: Mapping[str, Level], options: EvaluationOptions) -> dict[str, Integrity]:
     """Compare the protection levels of all runs with the errors at all alarm limits.
 
-    Return the comparison by kind of level; empty if no run has levels.
+    Return the comparison by kind of protection level; empty if no run has protection levels.
     """
     own = {limit for _, limit in runs.values() if limit is not None}
     limits = sorted({*options.alarm_limits_m, *own})

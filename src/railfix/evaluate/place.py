@@ -34,7 +34,7 @@ class Bracket:
 
     #: Index of the reference instant before each time, or of the instant at the time itself; shape (T,).
     left: Indices
-    #: Index of the reference instant after each time; equal to `left` if an instant is at the time itself; shape (T,).
+    #: Index of the reference instant after each time; equal to `left` if there is an instant at the time; shape (T,).
     right: Indices
     share: Floats  #: Fraction of the interval from left to right that has passed at each time, 0 to 1, shape (T,).
     inside: Masks  #: False before the first instant, after the last instant, and in gaps of the reference; shape (T,).
@@ -158,7 +158,8 @@ _ROUNDING_M: Final = 1e-3
 
 
 class TrackFiles(Settings):
-    """Files that replace the files of ``run.json``, and options for reading the track (without `reading.reference`)."""
+    """Files that replace the files of ``run.json``, and options for reading the track, of which `reference` is
+    unused."""
 
     track: tuple[Path, ...] = option(
         "Track map to use instead of the track in run.json.", (), metavar="TRACK", panel=INPUTS

@@ -84,8 +84,7 @@ class StationErrors:
     name: str
     time: Datetimes  #: Time of each epoch, shape (B,).
     satellite: Strings  #: Satellites, shape (S,).
-    #: Corrected pseudorange minus geometric range, and minus the receiver clock offset; NaN where not observed; shape
-    #: (B, S).
+    #: Corrected pseudorange minus geometric range and receiver clock offset; NaN where not observed; shape (B, S).
     error_m: Floats
     smoothed: bool  #: Whether the pseudoranges were smoothed by carrier phase.
 
@@ -182,9 +181,9 @@ def range_errors(
     """Compute the pseudorange errors of one antenna in one chunk of T epochs; `block_s` is the length of a block [s].
 
     The clock of each constellation is the robust mean of the residuals that passed the screens. Each range contributes
-    to the clock that is subtracted from it, so that its residual becomes too small; the factor ``1 / sqrt(1 - share)``,
-    with the weight `share` of the range in the clock, compensates for this. An error common to all satellites is
-    absorbed by the clock and does not affect the position. Without `base`, the satellite and atmospheric errors remain.
+    to the clock that is subtracted from it, so that its residual becomes too small. The factor ``1 / sqrt(1 - share)``
+    compensates for this; `share` is the weight of the range in the clock. An error common to all satellites is absorbed
+    by the clock and does not affect the position. Without `base`, the satellite and atmospheric errors remain.
 
     Raise MismatchError if fewer than two reference positions have a sigma within the limit.
     """

@@ -171,7 +171,7 @@ def error_tables(evaluation: Evaluation) -> list[Table]:
     overall, options = _together(evaluation.figures.filter(grouping="all")), evaluation.options
     paths = [run.path for run in evaluation.runs]
     again = [run.name for k, run in enumerate(evaluation.runs) if run.path in paths[:k]]
-    # conventional positions are the same in every table of a run
+    # list conventional positions once, because they are the same in every table of a run
     new = (pl.col("position") != "conventional") | ~pl.col("run").is_in(again)
     overall = overall.filter(new | (pl.col("epochs_of") == "common"))
     caption = (
@@ -366,7 +366,7 @@ MOST_BEYOND: Final = 200
 
 
 def write_evaluation(evaluation: Evaluation, folder: OutputFolder) -> dict[str, Path]:
-    """Write an evaluation and commit the folder; return the path of each file.
+    """Write an evaluation and complete its output folder; return the path of each file.
 
     Raise OutputError if a file cannot be written. The files are:
 

@@ -23,7 +23,7 @@ def channels_with_data(kinds: Iterable[Floats], loss_of_lock: Bytes) -> Masks:
     """Return whether a channel has a value in any array of `kinds` (T, M), or a loss-of-lock indicator; shape (M,)."""
     used = np.zeros(loss_of_lock.shape[1], dtype=np.bool_)
     for array in kinds:
-        used |= ~np.isnan(array[:1]).all(axis=0)  # fast: nearly all channels have data in this epoch
+        used |= ~np.isnan(array[:1]).all(axis=0)  # fast check: nearly all channels have data in the first epoch
         rest = np.flatnonzero(~used)
         used[rest] = ~np.isnan(array[:, rest]).all(axis=0)
     rest = np.flatnonzero(~used)
@@ -42,8 +42,8 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
     Returns
     -------
     Observations
-        Channels sorted by satellite, then signal. The header is that of the first part, extended by the signals and
-        GLONASS channels of the other parts. Problems are concatenated, and counters are summed.
+        Channels sorted by satellite, then signal. The header is taken from the first part, and extended by the signals
+        and GLONASS channels of the other parts. Problems are concatenated, and counters are summed.
 
     Raises
     ------
@@ -126,7 +126,7 @@ def stack_observations(observations: Sequence[Observations]) -> tuple[Observatio
         (each.satellite.tobytes(), each.signal.tobytes(), *sorted(each.header.glonass_channel.items()))
         for each in observations
     }
-    same = len(keys) == 1  # all antennas have the same channels, in the same order, and GLONASS frequencies
+    same = len(keys) == 1  # channels, their order and GLONASS frequencies are equal
     stacked = join_epochs(observations) if same else stack_parts(observations)
     return stacked, tuple(slice(a, b) for a, b in pairwise(ends))
 

@@ -103,7 +103,7 @@ def plausible_glonass(records: GlonassRecords) -> Masks:
 def plausible_radius(satellite: Strings, position_ecef_m: Floats) -> Masks:
     """Return whether the radius of each position (..., N, 3) fits the constellation's orbits, shape (..., N).
 
-    Positions of other constellations are accepted.
+    Positions of constellations without limits are accepted.
     """
     radius = np.linalg.norm(position_ecef_m, axis=-1)
     fine = np.ones(radius.shape, dtype=np.bool_)

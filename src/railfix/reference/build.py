@@ -2,7 +2,7 @@
 
 1. The positions of each antenna are checked singly, against the other antenna, and against the track (`fixes`).
 2. The Dopplers are solved for the speed along the track at positions interpolated between fixes.
-3. The distance between fixes is compared with the distance travelled; fixes that disagree are rejected.
+3. The distance between fixes is compared with the measured distance travelled; fixes that disagree are rejected.
 4. All measurements are smoothed (`smoother`). The Dopplers are then solved at the smoothed positions, and all
    measurements are smoothed again (`_ROUNDS` rounds).
 """
@@ -77,7 +77,7 @@ def _known_speeds(time: Datetimes, speed_mps: Floats, sigma_mps: Floats) -> Spee
 
 
 def combine_speeds(time: Datetimes, sources: Sequence[Speeds]) -> tuple[Floats, Floats]:
-    """Return the mean speed and its sigma, shapes (N,), NaN without speeds; inverse variances are the weights."""
+    """Return the mean speed, weighted by inverse variances, and its sigma, shapes (N,); NaN without speeds."""
     weight, total = np.zeros(len(time)), np.zeros(len(time))
     for source in sources:
         at = nearest_rows(time, source.time, within_ns=SAME_INSTANT_NS)

@@ -110,7 +110,7 @@ class ReferenceOptions(Settings):
 
 
 def fixes_table(name: str, part: Built, trajectory: Trajectory) -> pl.DataFrame:
-    """Return the rows of ``fixes.csv`` of one antenna, rounded to 0.1 mm."""
+    """Return one antenna's rows of ``fixes.csv``, rounded to 0.1 mm."""
     fixes = part.fixes
     words = {int(code): FixRejection(int(code)).text or "good" for code in np.unique(fixes.rejection)}
     table = pl.DataFrame(
@@ -132,7 +132,7 @@ def fixes_table(name: str, part: Built, trajectory: Trajectory) -> pl.DataFrame:
 
 
 def antenna_record(part: Built) -> dict[str, Any]:
-    """Return the record of one antenna in ``reference.json``, as plain values."""
+    """Return one antenna's entry in ``reference.json``, as plain values."""
     reference = part.reference
     sigma = reference.sigma_m[reference.source == "bridged"]
     return {

@@ -48,7 +48,7 @@ class ReferenceSettings(Settings):
     """Limits and noise of a reference, which are recorded in ``reference.json``."""
 
     #: Smallest accepted ratio of a fix in the ambiguity test, if the log has the ratio (RTKLIB's default is 3).
-    ratio: float = _limit("Smallest ratio of the ambiguity test, where the log has it.", 3.0, "RATIO", "--ratio")
+    ratio: float = _limit("Smallest accepted ambiguity ratio, if the log has ratios.", 3.0, "RATIO", "--ratio")
     #: Largest difference between the measured distance of the two antennas and their distance on the vehicle (P2 3.3: 5
     #: cm).
     spacing_m: float = _limit(
@@ -69,7 +69,7 @@ class ReferenceSettings(Settings):
     #: Longest gap between good fixes that is bridged.
     max_gap_s: float = _limit("Longest gap between good fixes that is bridged.", 60.0, "S", "--max-gap")
     #: Largest standard deviation of the position at a bridged instant; less certain positions are omitted.
-    max_sigma_m: float = _limit("Largest standard deviation of a bridged instant.", 1.0, "M", "--max-sigma")
+    max_sigma_m: float = _limit("Largest standard deviation of a bridged position.", 1.0, "M", "--max-sigma")
     #: Standard deviation of a fix along the track where the log has no standard deviation.
     fix_sigma_m: float = _positive(0.03)
 

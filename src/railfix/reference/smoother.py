@@ -2,8 +2,8 @@
 
 The states at each instant are position, speed and acceleration, and slowly varying errors of the sensors: the error of
 the Doppler speed, the difference between wheel distance and position, the wheel's scale error, and the accelerometer's
-offset. A forward-backward smoother distributes the closing error of a gap in proportion to the variance of each
-contribution.
+offset. A forward-backward smoother distributes the closing error over a gap in proportion to the variances of the
+measurements.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def instants(rows: Datetimes, others: Sequence[Datetimes]) -> Datetimes:
 class Evidence:
     """Measurements along one antenna's path at N instants; NaN where missing."""
 
-    time: Datetimes  #: Increasing, with steps of a few seconds at most; shape (N,).
+    time: Datetimes  #: Times, increasing with steps of a few seconds at most; shape (N,).
     fix_m: Floats  #: Arc length of good fixes, shape (N,).
     fix_sigma_m: Floats  #: Standard deviation of `fix_m`, shape (N,).
     doppler_mps: Floats  #: Speed along the path from Dopplers, shape (N,).
@@ -174,9 +174,8 @@ def _motion(states: _States, evidence: Evidence, dt: Floats, settings: Reference
     """Return the transitions from the previous instant to each instant, and the noise covariances, shapes (N, n, n).
 
     The states are position, speed and a time-correlated acceleration (Singer's model). The Doppler speed's error is a
-    first-order Gauss-Markov process. The difference between wheel distance and position grows by the scale-factor error
-    times the distance, and changes randomly by slip. The wheel's scale-factor error and the accelerometer's offset are
-    random walks.
+    first-order Gauss-Markov process. The difference between wheel distance and position grows by the scale error times
+    the distance, and changes randomly by slip. The wheel's scale error and the accelerometer's offset are random walks.
     """
     count = len(evidence.time)
     transition, noise = np.zeros((2, count, states.count, states.count))
@@ -291,7 +290,8 @@ def lasting_error_mps(misclosures: Closings, settings: ReferenceSettings) -> flo
 
 
 def slip_m(misclosures: Closings, settings: ReferenceSettings) -> float:
-    """Estimate the wheel's random error [m per square root of m] from the closing errors, without the scale error.
+    """Estimate the wheel's random error [m per square root of m] from the closing errors, after removing the scale
+    error.
 
     With fewer than `WINDOWS` windows in motion, the setting is returned.
     """

@@ -1,11 +1,10 @@
 """Select the navigation record of a satellite at an epoch; lookups and orbit elements are computed once and cached.
 
 The newest record transmitted before the epoch is selected. A record without a transmission time counts as transmitted
-half-way between its own and the previous record's reference time. Where the newest record is outside its validity
-(expired while an older one is still valid, or transmitted long before its validity begins), or where all records were
-transmitted after the epoch (a file that begins later than the log), the record with the nearest reference time is
-selected if it is valid, and flagged if it had not been transmitted yet. Health is taken from the selected record, and
-not from an older healthy record.
+half-way between its own and the previous record's reference time. If the newest record is not valid at the epoch, or if
+all records were transmitted after the epoch (a file that begins later than the log), the record with the nearest
+reference time is selected, provided that it is valid. A selected record that was not yet transmitted is flagged. Health
+is taken from the selected record, even if an older record is healthy.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ _MILLISECOND: Final = np.timedelta64(1, "ms")
 
 @dataclass(frozen=True)
 class Lookup:
-    """Records of all satellites in two lists for bisection, sorted by time of availability and by start of use."""
+    """Records of all satellites in two lists for bisection, one sorted by time of availability, one by start of use."""
 
     number: Mapping[str, int]  #: Lookup number by satellite, or by satellite and message ("E01 INAV").
     first: Integers  #: First record of each satellite in both lists, shape (satellites,).
@@ -146,7 +145,7 @@ def unhealthy(records: KeplerRecords, signal: str) -> Masks:
 
     A signal is flagged by any of the six health bits in GPS LNAV, by the bits of this signal for QZSS and Galileo, by
     the bit of its band in CNAV, and by SatH1 or HS for BeiDou. A signal is also unhealthy if a Galileo record predicts
-    no accuracy (SISA "NAPA", written as -1, marginal by OS SDD 1.3, 2.3.1.4), or the accuracy of any record is above
+    no accuracy (SISA "NAPA", written as -1, marginal by OS SDD 1.3, 2.3.1.4), or if the accuracy of the record exceeds
     `LARGEST_ACCURACY_M`.
     """
     system = records.satellite.astype("<U1")
@@ -166,15 +165,15 @@ def group_delay_s(records: KeplerRecords, signal: str, *, clock: ClockReference 
     """Compute the group delay of a signal relative to the satellite clock, shape (n,) [s].
 
     ======== =====================================================================================
-    GPS,     TGD on L1, (f1/f2)^2 TGD on L2 (IS-GPS-200, 20.3.3.3.3.2). CNAV and CNAV-2: TGD - ISC on
-    QZSS     L1 C/A, L2C, L5 and L1C (IS-GPS-200, 30.3.3.3.1.1; IS-GPS-705, 20.3.3.3.1.2; IS-GPS-800,
-             3.5.3.9). LNAV has no ISC: TGD on L5 (`group_delay_sigma_m`).
-    Galileo  OS SIS ICD 5.1.5. Clocks of I/NAV refer to E1 and E5b, of F/NAV to E1 and E5a. E1 uses
-             the BGD of its clock; E5a and E5b follow from both BGDs. F/NAV has no BGD E5b/E1:
-             BGD E5a/E1 is used instead. NaN on E6, whose delay is not broadcast.
-    BeiDou   The clock refers to B3I (B1I ICD 3.0, 5.2.4.10), 0 on B3I. D1 and D2: TGD1 on B1I, TGD2 on B2I.
-             CNV1, CNV2 (B1C ICD 1.0, 7.6; B2a ICD 1.0, 7.6): TGD_B1Cp and TGD_B2ap on the pilots, with ISC on
-             the data signals. CNV3: TGD_B2bI on B2b. NaN on signals whose delay the message does not contain.
+    GPS,     LNAV: TGD on L1, and (f1/f2)^2 TGD on L2 (IS-GPS-200, 20.3.3.3.3.2). On L5, TGD is used with an additional
+    QZSS     sigma (`ranges.second_codes.group_delay_sigma_m`), because LNAV has no ISC. CNAV and CNAV-2: TGD - ISC on
+             L1 C/A, L2C, L5, L1C (IS-GPS-200, 30.3.3.3.1.1; IS-GPS-705, 20.3.3.3.1.2; IS-GPS-800, 3.5.3.9).
+    Galileo  The clock of I/NAV refers to E1 and E5b, and the clock of F/NAV refers to E1 and E5a (OS SIS ICD 5.1.5).
+             E1 uses the BGD of the clock's pair. E5a and E5b use both BGDs; F/NAV has only BGD E5a/E1, which replaces
+             BGD E5b/E1. The delay on E6 is not broadcast (NaN).
+    BeiDou   The clock refers to B3I (B1I ICD 3.0, 5.2.4.10), on which the delay is 0. D1 and D2: TGD1 on B1I, TGD2 on
+             B2I. CNV1 and CNV2: TGD_B1Cp and TGD_B2ap on the pilots, with ISC on the data signals (B1C and B2a ICD
+             1.0, 7.6). CNV3: TGD_B2bI on B2b. On other signals, the delay is NaN.
     ======== =====================================================================================
 
     `clock` is the source of the satellite clock: the record ("broadcast") or SP3 files ("ionosphere_free"), whose
@@ -329,7 +328,7 @@ def _rows(of_signal: Callable[[str], NDArray[np.generic]], codes: list[str], rec
     return np.array([of_signal(code) for code in codes], dtype=np.float64).reshape(len(codes), records)
 
 
-#: For signals whose group delay is not in LNAV, D1, D2, I/NAV or F/NAV: the message that contains it, by constellation.
+#: Messages with the group delays that are not in LNAV, D1, D2, I/NAV and F/NAV, by constellation and signal.
 _MESSAGE_OF: Final = {
     **dict.fromkeys(("G2S", "G2L", "G2X", "G5I", "G5Q", "G5X", "J2S", "J2L", "J2X", "J5I", "J5Q", "J5X"), "CNAV"),
     **dict.fromkeys(("G1S", "G1L", "G1X", "J1S", "J1L", "J1X"), "CNV2"),

@@ -88,14 +88,13 @@ def satellite_states(
     code_m : ndarray, shape (T, M) [m]
         NaN where not observed.
     navigation : Navigation
-        With `precise` set, positions and clocks come from the precise ephemeris, and a satellite
-        absent from it has no record; health and group delays come from the nearest broadcast
-        record of any age, and a satellite without a broadcast record has no record either.
+        If `precise` is set, positions and clocks are taken from the precise ephemeris; health and group delays are
+        taken from the nearest broadcast record of any age. A satellite that is absent from either has no record.
     max_age_s : float, optional
         Limit on the time between epoch and toe, in addition to the validity of the records [s].
     record : ndarray of int, shape (T, M), optional
         Rows of `navigation.kepler` to use, because corrections refer to one issue of data (`issue_records`); -1 for the
-        usual selection. A satellite is unhealthy also where the usual selection's record flags it. Ignored for GLONASS.
+        usual selection. A satellite is also unhealthy if the usual record flags it. Ignored for GLONASS.
 
     Raises
     ------
@@ -251,7 +250,7 @@ def _fill_precise(
     absent = (column < 0) | (states.no_record.all(axis=0) & ~glonass)
     m, t = np.nonzero(observed.T & ~absent[:, None])
     travel = -code_m[t, m] / SPEED_OF_LIGHT
-    # As with broadcast clocks, the time of transmission is computed without the relativistic part (below 0.4 us).
+    # As with broadcast clocks, the time of transmission is computed without the relativistic correction (below 0.4 us).
     clock = precise_clock_s(precise, column[m], time[t], travel)
     position, velocity, clock = precise_state(precise, column[m], time[t], travel - np.nan_to_num(clock))
     missing = np.isnan(position[0]) | np.isnan(clock)
