@@ -158,8 +158,7 @@ _ROUNDING_M: Final = 1e-3
 
 
 class TrackFiles(Settings):
-    """Files that replace the files of ``run.json``, and options for reading the track, of which `reference` is
-    unused."""
+    """Files that replace the files of ``run.json``, and options for reading the track other than `reference`."""
 
     track: tuple[Path, ...] = option(
         "Track map to use instead of the track in run.json.", (), metavar="TRACK", panel=INPUTS

@@ -290,8 +290,7 @@ def lasting_error_mps(misclosures: Closings, settings: ReferenceSettings) -> flo
 
 
 def slip_m(misclosures: Closings, settings: ReferenceSettings) -> float:
-    """Estimate the wheel's random error [m per square root of m] from the closing errors, after removing the scale
-    error.
+    """Estimate the wheel's random error [m per square root of m] from the closing errors, excluding the scale error.
 
     With fewer than `WINDOWS` windows in motion, the setting is returned.
     """
