@@ -43,8 +43,8 @@ class Authority(Message):
     #: Lower chainage [cm], upper chainage [cm] and highest speed [cm/s] of each speed restriction in the train's
     #: interval.
     restrictions: Annotated[tuple[SpeedPart, ...], Field(max_length=MOST_PARTS)] = ()
-    #: Chainage [cm] and gradient [per mille] of each part. A gradient applies up to the next part's chainage, and is
-    #: positive where the track rises with the chainage.
+    #: Chainage [cm] and value [per mille] of each gradient. A gradient applies up to the chainage of the next gradient,
+    #: and is positive where the track rises with the chainage.
     gradients: Annotated[tuple[GradientPart, ...], Field(max_length=MOST_PARTS)] = ()
 
     def encode(self) -> bytes:

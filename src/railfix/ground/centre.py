@@ -122,7 +122,7 @@ class CentreLimits(Settings):
     clock_s: float = Field(default=1.0, ge=0)
     #: Largest accepted lead of a sequence number over the newest number, immediately after the newest number arrived.
     jump: int = Field(default=1000, ge=1)
-    #: Increase of this largest lead per second since the newest number arrived.
+    #: Increase of `jump` per second since the newest number arrived.
     rate: float = Field(default=20.0, gt=0)
 
     @model_validator(mode="after")
@@ -139,7 +139,7 @@ class TrainRecord:
     train: int
     state: TrainState = TrainState.UNKNOWN
     sequence: int = -1  #: Newest sequence number received, -1 before the first.
-    session: int = 0  #: Identifier of the session of `sequence`; the on-board unit draws a new one at each start.
+    session: int = 0  #: Identifier of the session of `sequence`, drawn by the on-board unit at each start.
     retired: tuple[int, ...] = ()  #: Identifiers of earlier sessions, whose late messages are rejected.
     counted_s: float | None = None  #: Time on the centre's clock when the newest sequence number arrived [s].
     rejected: str | None = None  #: Reason why the newest report was rejected, None if it was accepted.
@@ -235,7 +235,7 @@ def time_passed(
     curves : dict of int to ReferenceCurve
         Reference run curves by running direction.
     authority_m : float, optional [m]
-        End of the train's authority. When the simulated position reaches it, the train is in error.
+        End of the train's authority. When the simulated position reaches this end, the train is in error.
     limits : CentreLimits
     """
     if record.message is None or record.state is TrainState.UNKNOWN or record.message.chainage_cm is None:

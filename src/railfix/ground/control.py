@@ -35,7 +35,7 @@ _CAUSE = "cause of the stop"
 def _severity(verdict: TriangleVerdict) -> int:
     """Return the severity of a verdict; each step uses the most severe verdict since the previous step."""
     if verdict in (TriangleVerdict.MONITOR_LOST, TriangleVerdict.JAMMING):
-        return 2  # missing fixes stop trains only after `MonitorLimits.late_s`
+        return 2  # less severe, because missing fixes stop trains only after `MonitorLimits.late_s`
     return 3 if verdict in STOPPING else int(verdict is not TriangleVerdict.HEALTHY)
 
 

@@ -50,7 +50,7 @@ class OrderDesk:
     clock: Callable[[], float]  #: Centre's clock [s].
     log: Callable[..., None]  #: Function that writes a line to the log.
     release: Callable[[], str | None]  #: Function that releases a stop of all trains.
-    stop: Callable[[int | None], str | None]  #: Function that stops a train, or every train with None.
+    stop: Callable[[int | None], str | None]  #: Function that stops a train, or every train (None).
     #: Time [s] and author of each order that awaits confirmation, by name and values of the order.
     _asked: dict[str, tuple[float, str]] = field(default_factory=dict)
 

@@ -59,7 +59,7 @@ class StationFixes(FrozenArrays):
 
 
 def station_fixes(logs: list[Observations], points_ecef_m: Floats, navigation: Navigation) -> StationFixes:
-    """Compute the fixes of the receivers of a triangle, with the default settings of a run.
+    """Compute the fixes of a triangle's receivers with the default settings of a run.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """Redundancy layer above two links: frames with sequence numbers and time stamps, as defences according to EN 50159.
 
-The links encrypt and authenticate frames (QUIC, TLS 1.3); the CRC of a frame detects faults in the layers between, and
-does not protect against attacks. A receiver uses each frame once, from the link that delivers it first. It does not use
-frames that are older than a frame already used.
+The links encrypt and authenticate frames (QUIC, TLS 1.3); the CRC of a frame detects faults between this layer and the
+links, but does not protect against attacks. A receiver uses each frame once, from the link that delivers it first. It
+does not use frames that are older than a frame already used.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class Echo(NamedTuple):
         return cls(*_ECHO.unpack(payload)) if len(payload) == _ECHO.size else None
 
     def round_trip_s(self, now_ns: int) -> float:
-        """Return the round-trip time without the time to the answer [s], for an echo that arrives at `now_ns`."""
+        """Return the round-trip time minus the answer delay of the other end [s]; the echo arrives at `now_ns`."""
         return (now_ns - self.sent_ns - (self.answered_ns - self.received_ns)) / 1e9
 
 
@@ -107,7 +107,7 @@ class ReceiverLimits(Settings):
     drift: float = Field(default=1e-4, ge=0)
     #: Largest accepted lead of a sequence number over the newest number, immediately after the newest number arrived.
     jump: int = Field(default=1000, ge=1)
-    #: Increase of this largest lead per second since the newest number arrived.
+    #: Increase of `jump` per second since the newest number arrived.
     rate: float = Field(default=100.0, gt=0)
 
 

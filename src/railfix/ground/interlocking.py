@@ -21,7 +21,7 @@ from railfix.ground.state import Interlocking, InterlockingLimits, PointState, T
 
 
 class NearbyTrains:
-    """Index of trains by the blocks of the line that a train's interval, route and next route include.
+    """Index of trains by block of the line; a train's blocks cover its interval, route and next route.
 
     With this index, the time of a step grows with the number of trains, not with the number of pairs of trains.
     `update` locates only trains whose interval or route has changed.

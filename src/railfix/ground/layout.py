@@ -152,7 +152,7 @@ class Layout(Settings):
         return self.points_between(-math.inf, math.inf)
 
     def pieces(self, from_m: float, to_m: float, tracks: Mapping[int, int]) -> list[Piece]:
-        """Return the pieces of track of an interval; `tracks` has the train's track by station (default 1)."""
+        """Return the pieces of track of an interval; `tracks` is the train's track by station (default 1)."""
         low, high = min(from_m, to_m), max(from_m, to_m)
         pieces, at = [], low
         for k in self.stations_between(low, high):

@@ -192,7 +192,7 @@ def older_place(report: PlacedReport) -> str | None:
 
 
 def longest_way_m(before: float | None, now: float | None, elapsed_s: float, limits: InterlockingLimits) -> float:
-    """Return the longest distance [m] that a train can have run in a time, given its speeds before and after."""
+    """Return the longest distance [m] that a train can have run in `elapsed_s`, given its speeds before and after."""
     top = limits.speed_mps
     if before is not None and now is not None:
         # highest speed between the two reports: the higher reported speed, plus the largest error of a reported speed,

@@ -160,7 +160,7 @@ class Store:
                 self._forget_old_lines(len(notes))
 
     def _forget_old_lines(self, added: int) -> None:
-        """Delete the oldest log lines beyond the limit, each time a hundredth of the limit has been added."""
+        """Delete the log lines that exceed the limit, whenever a hundredth of the limit has been added."""
         self._written += added
         if self._written <= self._most_lines // 100:
             return

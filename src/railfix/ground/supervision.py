@@ -104,7 +104,7 @@ class Supervision:
                 self.awaited.discard(number)
             elapsed_s, clock, is_new = self._read_clock(message, before, now_s)
             self.state = report_received(self.state, message, self.layout, limits=self.limits, elapsed_s=elapsed_s)
-            # the clock delay from a contradicted report could make the centre accept too long distances later
+            # a clock delay from a contradicted report could lengthen the distances that are accepted later
             if is_new or self.state.trains[number].contradiction is None:
                 self._clocks[number] = clock
             self.state = answer_received(self.state, message)
@@ -160,7 +160,7 @@ class Supervision:
         self.state = points_reported(self.state, point, track, self.layout)
 
     def has_lapsed(self, train: int, now_s: float) -> bool:
-        """Return whether every authority by which a train may run has lapsed on board.
+        """Return whether every authority that permitted a train to run has lapsed on board.
 
         On board, the age of an authority is counted from the sending of the report that it answers, which is before the
         sending of the authority.
