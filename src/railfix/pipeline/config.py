@@ -205,8 +205,7 @@ class Config(ScreenSettings):
     smoothing: SmoothingLimits = SmoothingLimits()  #: Limits of the smoothing of codes by the carrier phase.
     continuity: ContinuityLimits = ContinuityLimits()  #: Limits of the test of phase changes along the line.
     phase: PhaseLimits = PhaseLimits()  #: Limits of the float and integer ambiguities.
-    #: Filter along the track, which combines codes, Dopplers, carrier-phase changes and sensors of this and earlier
-    #: epochs.
+    #: Filter along the track. It combines codes, Dopplers, phase changes and sensors of this and earlier epochs.
     filter: Literal["track", "off"] = "track"
     #: Measurements of the filter. Satellites provide `code`, `phase` and `doppler`; on-board sensors provide the
     #: others. `feature` is the position of a line feature that the inertial unit and the tachometer detect.

@@ -238,9 +238,7 @@ def _due(second: Integers, rows: slice, alarms: Bytes, breaks: Masks, state: Int
 def _on_all_epochs(
     due: _Due, found: Interference | None, state: InterferenceState
 ) -> tuple[Interference, InterferenceState]:
-    """Return the interference of all epochs of one antenna; each epoch gets the result of the first epoch of its
-    second.
-    """
+    """Return the interference of each epoch of one antenna: the result of the first epoch of the same second."""
     known = [each for each in (state.latest, found) if each is not None]
     if len(due.group) == 1:
         every = latest = known[-1]

@@ -142,9 +142,7 @@ def _phase_rates(
 
 
 def _without(corrected: CorrectedRanges, letters: Strings, bad: dict[int, Masks]) -> CorrectedRanges:
-    """Return the ranges without the Dopplers (kind 0) or phases (kind 1) of bad constellations; `bad` has a mask (T, K)
-    for each bad kind.
-    """
+    """Remove Dopplers (kind 0) or phases (kind 1) of bad constellations; `bad` has a mask (T, K) for each bad kind."""
     obs: Observations = corrected.observations
     of_channel: Indices = (obs.satellite.astype("<U1")[:, None] == letters).astype(np.intp)
     values = {"doppler_hz": obs.doppler_hz, "phase_cycles": obs.phase_cycles}

@@ -14,8 +14,7 @@ from railfix.core.timescale import seconds
 _NEVER: Final = np.datetime64("NaT", "ns")
 #: Time constant of the mean offset of a train off the map [s].
 _REMEMBERED_S: Final = 30.0
-#: A train is back on the line if the mean offset of its positions is at most this fraction of the mean offset off the
-#: map.
+#: Largest ratio of the mean offset on the map to the mean offset off the map at which a train is back on the line.
 _BACK_SHARE: Final = 0.5
 #: A train is also back on the line if the mean offset of its positions is at most this limit [m].
 _BACK_M: Final = 1.0

@@ -223,8 +223,7 @@ def _nominal_variance_m2(model: LinearModel, nominal_elevation_sigma_m: Floats) 
 def _ambiguity_variance_m2(ranges: Ranges, antennas: AntennaRows, fix: LineFix, arc: Floats, config: Config) -> Floats:
     """Return the squared distance to the best alternative position, times its probability, shape (T,) [m^2].
 
-    If its weighted sum of squares is larger by x, its probability is ``1/(1 + exp(x/2))`` (normal likelihoods, equal
-    priors).
+    If its weighted sum of squares is larger by x, its probability is ``1/(1 + exp(x/2))`` (equal priors, normal noise).
     """
     section, square = fix.section, np.zeros(len(ranges))
     open_ones = (section.other_vertex >= 0) & (section.excess <= config.section.threshold) & np.isfinite(arc)
