@@ -311,7 +311,7 @@ def test_fixes_computed_elsewhere_are_judged_with_limits_of_their_grade(tmp_path
     assert "2024-03-05T02:00:21" < first[:19] <= "2024-03-05T02:00:26"
     for more, sentence in (
         ([], "--point is missing"),
-        ([*known, "--nav", str(logs[0])], "--nav has no use with --fixes"),
+        ([*known, "--nav", str(logs[0])], "--nav cannot be used with --fixes"),
     ):
         refused = CliRunner().invoke(app, [*words, "--overwrite", *more])
         assert refused.exit_code == 4

@@ -146,7 +146,7 @@ def read_fixes(logs: Sequence[str], nav: Sequence[Path], points: Sequence[str], 
     known = np.array([parse_position(text, "--point") for text in points])
     if computed:
         if nav:
-            raise SettingsError("--nav has no use with --fixes: positions are not computed again")
+            raise SettingsError("--nav cannot be used with --fixes: positions are not computed again")
         if not len(known):
             raise SettingsError(
                 "--point is missing: logs of positions contain no known points; give it for each receiver"

@@ -1,4 +1,4 @@
-"""State of the interlocking (intervals of trains, points, bars, speed restrictions), and its stored texts.
+"""State of the interlocking: intervals of trains, points, bars and speed restrictions.
 
 The state is stored as texts: one head text, one text per train, and one text per set of points. Values are immutable:
 each step returns new values.
@@ -55,8 +55,8 @@ class TrainInterval:
     station: int  #: Station where the route ends.
     length_m: float  #: Length of the train as configured.
     standstill: bool = True
-    #: Safe rear end of the newest report; the interval begins there once the next report confirms it. None if the
-    #: newest report does not confirm the train's integrity and length.
+    #: Safe rear end of the newest report. The interval begins there after the next report confirms this position. None
+    #: if the newest report does not confirm the train's integrity and length.
     claimed_m: float | None = None
     line: int | None = None  #: Line number in the train's reports; None before the first report.
     #: Time of the newest position by the train's clock; None before the first report since the train's unit was
@@ -187,7 +187,7 @@ def stop_trains(state: Interlocking, trains: Iterable[int], reason: str) -> Inte
     return state
 
 
-#: Name of the head text, and beginning of the names of the texts of trains and points.
+#: Name of the head text. The names of the texts of trains and points begin with this name.
 HEAD: Final = "interlocking"
 _TRAIN, _POINTS = f"{HEAD} train ", f"{HEAD} points "
 
@@ -218,7 +218,7 @@ def to_documents(state: Interlocking, before: Interlocking | None = None) -> dic
 def from_documents(texts: Mapping[str, str | None]) -> Interlocking:
     """Return the state from its texts.
 
-    The times until points are released begin again, because the clock of the earlier process is unknown.
+    The times until points are released start again, because the clock of the earlier process is unknown.
 
     Raise InputFileError if the texts were written by an older version.
     """

@@ -120,7 +120,7 @@ async def read_source(
 async def _keep_open(
     opened: Callable[[], AsyncIterator[bytes]], settings: LiveSettings
 ) -> AsyncIterator[bytes | Connected | Lost]:
-    """Yield the bytes and events of a connection, which is reopened after growing waits.
+    """Yield the bytes and events of a connection; if it breaks, it is reopened after increasing waits.
 
     `opened` returns an iterator that yields empty bytes once the connection is open, and then the received bytes.
     """

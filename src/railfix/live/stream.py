@@ -1,8 +1,8 @@
 """Decoding of a source's data as they arrive: epochs, navigation records, SBAS messages and sensor samples.
 
-Samples of a sensor arrive as lines, which are the rows of a CSV table. The first line has the names of the columns, as
-in the tables of ``railfix run``; this line may be repeated after a break of the connection. A row that has only the
-time reports that nothing was measured up to this time, for example by a tachometer at standstill.
+Samples of a sensor arrive as lines, which are the rows of a CSV table. The first line contains the names of the
+columns, as in the tables of ``railfix run``; this line may be repeated after a break of the connection. A row that
+contains only the time reports that nothing was measured up to this time, for example by a tachometer at standstill.
 
 `Lag` measures how far a session is behind the receivers, and selects the epochs to be skipped if the delay is too long.
 """
