@@ -63,7 +63,7 @@ _MOST_BEYOND: Final = 5  #: Maximum number of printed epochs with an error above
 def show_evaluation(evaluation: Evaluation, files: dict[str, Path], *, verbose: bool) -> None:
     """Print the verdict, the references of each run, the tables, and the paths of the written files.
 
-    Without `verbose`, only the tables in `_MAIN_TABLES` are printed, and with alarm limits also the Stanford counts.
+    Without `verbose`, only the tables in `_MAIN_TABLES` are printed, and the Stanford counts if there are alarm limits.
     """
     console = TableConsole()
     show_verdict(console, verdict_of_evaluation(evaluation))
@@ -182,9 +182,9 @@ def reference(
 
     A position is rejected if it is not an RTK fix, has a low ambiguity ratio, is too far from the antenna's trajectory,
     disagrees with the distance travelled, or disagrees with the distance between the two antennas. The remaining
-    positions are matched to the trajectory. The gaps between these positions are bridged with Doppler speeds,
-    tachometer pulses and accelerations, as far as they are available, weighted by their inverse variances. The closing
-    error of a gap is distributed over the gap. The following files are written into DIR:
+    positions are matched to the trajectory. The gaps between these positions are bridged with the available Doppler
+    speeds, tachometer pulses and accelerations, weighted by their inverse variances. The closing error of a gap is
+    distributed over the gap. The following files are written into DIR:
 
     - `reference.csv`: one row per instant and antenna; position, speed, standard deviation, source `rtk` or `bridged`
     - `fixes.csv`: every position with its test result and measurements
@@ -274,7 +274,7 @@ def priors_text(rate: FaultRate) -> str:
     """Return a sentence on the fault priors that a run with this model assumes."""
     if not rate.bounds_priors:
         return (
-            f"Too few blocks to bound both priors by {LARGEST_PRIOR:g}: the levels of runs with this model stay "
+            f"Too few blocks to bound both priors by {LARGEST_PRIOR:g}: protection levels of runs with this model stay "
             "indicative, unless settings state risk.local_prior and risk.side_prior"
         )
     return (
@@ -295,11 +295,12 @@ def _print_model(model: ErrorModel, samples: ErrorSamples) -> None:
     show_table(console, plain_table(head, [list(row) for row in summary(model)]))
     if (rate := model.faults) is not None:
         console.print(
-            f"local faults: {rate.faulty} of {rate.ranges:,} used ranges exceed {rate.beyond_sigma:g} sigma of the "
-            f"level (fraction {rate.prior:.2g}; {rate.faulty_blocks} of {rate.blocks:,} blocks; at most "
-            f"{rate.upper:.2g} with 95 % confidence). Two satellites are faulty together {rate.together:.1f} times as "
-            "often as independent satellites would be. Low satellites on one side of the track are faulty together in "
-            f"{rate.side_faulty_blocks} of {rate.side_blocks:,} blocks (side_prior at most {rate.side_upper:.2g}). "
+            f"local faults: errors of {rate.faulty} of {rate.ranges:,} used ranges exceed {rate.beyond_sigma:g} times "
+            f"the sigma of the protection level (fraction {rate.prior:.2g}; {rate.faulty_blocks} of {rate.blocks:,} "
+            f"blocks; at most {rate.upper:.2g} with 95 % confidence). Two satellites are faulty together "
+            f"{rate.together:.1f} times as often as independent satellites would be. Low satellites on one side of the "
+            f"track are faulty together in {rate.side_faulty_blocks} of {rate.side_blocks:,} blocks (side_prior at "
+            f"most {rate.side_upper:.2g}). "
             f"{priors_text(rate)}"
         )
         if stretches := ", ".join(f"[{start:g}, {end:g}]" for start, end in rate.no_level_m):

@@ -270,8 +270,8 @@ def _print_quality(quality: TrackQuality, picture: Path | None) -> None:
     needed = needed_spacing_m(quality)
     if needed < spacing.max():
         console.print(
-            f"points every {needed:.1f} m would keep the chords of the sharpest curve within 1 cm of the arc; between "
-            "points the antenna's path follows the arc"
+            f"with points every {needed:.1f} m, the chords of the sharpest curve would be within 1 cm of the arc; the "
+            "antenna's path follows the arc between the points"
         )
     show_notes(console, track.provenance.notes)
     rows = []

@@ -88,14 +88,14 @@ class MatchOptions(Settings):
         gt=0.0,
     )
     within: float | None = option(
-        "Largest distance of a position from a track; by default 30 m, up to 100 m where LOG states larger sigmas.",
+        "Largest distance of a position from a track; by default 30 m, or up to 100 m if LOG states larger sigmas.",
         None,
         metavar="M",
         gt=0.0,
     )
     fill: Rows = option(
         "Rows that are filled along the shortest route. gaps: rows without a position between known positions; "
-        "off-map: also rows whose positions lie off the map, as in a tunnel, including rows at the start and end "
+        "off-map: also rows whose positions are off the map, as in a tunnel, including rows at the start and end "
         "of LOG.",
         "gaps",
     )

@@ -84,12 +84,12 @@ def service(
             f"({100 * worst['within_limit_share']:.0f} % of its epochs)"
         )
     else:
-        verdict.append("the runs have no filter and no protection levels; the fractions are those of single epochs")
+        verdict.append("the runs have no filter and no protection levels; the fractions are of single epochs")
     show_verdict(console, verdict)
     caption = (
-        f"Stretches of {stretch:g} m from the stated chainage. Satellites and levels: median and percentile of the "
-        "epochs. 3-D: distance of the 3-D position from the line. Filter: fraction of epochs with a level. Served: "
-        "fraction of epochs with a level within the limit"
+        f"Stretches of {stretch:g} m from the stated chainage. Satellites and protection levels: median and percentile "
+        "of the epochs. 3-D: distance of the 3-D position from the line. Filter: fraction of epochs with a protection "
+        "level. Served: fraction of epochs with a protection level within the limit"
     )
     table = listing("service", found, _COLUMNS, caption)
     show_table(console, table)

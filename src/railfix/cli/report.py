@@ -50,7 +50,7 @@ def report(
         list[Path] | None,
         typer.Option(
             metavar="RUN",
-            help="Another run on the same log; the conventional positions of this run are shown. A run with `--screens "
+            help="Another run on the same log, whose conventional positions are shown. A run with `--screens "
             "elevation` has unscreened positions, as in P1. Repeat the option with one for each run in order.",
         ),
     ] = None,

@@ -103,7 +103,7 @@ def is_number(kind: Any) -> bool:
 
 
 Model = TypeVar("Model", bound=BaseModel)
-INPUTS: Final = "Inputs"  #: Heading, in the help text, of the options that name input files.
+INPUTS: Final = "Inputs"  #: Help-text heading of the options that name input files.
 
 
 def validate(model: type[Model], values: Mapping[str, Any], *, source: str) -> Model:

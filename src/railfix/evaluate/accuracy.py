@@ -205,8 +205,8 @@ FIGURE_COLUMNS: Final[dict[str, str]] = {
     "std_m": "population standard deviation of the error",
     "rms_m": "root mean square error",
     **dict.fromkeys(("p50_m", "p95_m", "p99_m", "max_m"), "percentile or maximum of the error magnitude"),
-    "lowest_m": "error furthest toward the start of the line",
-    "highest_m": "error furthest toward the end of the line",
+    "lowest_m": "most negative error (toward the start of the line)",
+    "highest_m": "most positive error (toward the end of the line)",
     "max_at_time": "GPS time of the largest error magnitude",
     "max_at_chainage_m": "chainage of the reference at the time of the largest error magnitude",
     **dict.fromkeys((f"over_{limit}_m" for limit in OVER_M), "fraction of errors above this magnitude"),
@@ -220,7 +220,7 @@ FIGURE_COLUMNS: Final[dict[str, str]] = {
     **dict.fromkeys(("normalised_mean", "normalised_rms"), "mean or root mean square of error / along_sigma"),
     **dict.fromkeys(("normalised_p68", "normalised_p95"), "percentile of the magnitude of error / along_sigma"),
     **dict.fromkeys((f"over_{n}_sigma" for n in (1, 2, 3)), "fraction of errors above this multiple of along_sigma"),
-    "blocks": "number of time blocks for the confidence limits that follow",
+    "blocks": "number of time blocks from which the confidence limits are computed",
     **dict.fromkeys(LIMIT_COLUMNS, "lower (`_low`) or upper (`_high`) confidence limit"),
 }
 #: Statuses of positions that passed every check, in single epochs and in the filter along the track.

@@ -193,8 +193,8 @@ BENCHMARK_COLUMNS: Final[dict[str, str]] = {
     "antenna": "`front` or `rear`; `all` where both are combined",
     **{name: FIGURE_COLUMNS[name] for name in _OF_FIGURES},
     "time_to_first_s": "time from the first epoch with observations to the first position",
-    "over_level": "number of errors above a usable level (no alarm, and a status with a bounded error)",
-    "over_level_alarm": "number of errors above a level that was not usable, because of an alarm or the status",
+    "over_level": "number of errors above a usable protection level (no alarm, and a status with a bounded error)",
+    "over_level_alarm": "number of errors above a protection level that is unusable because of an alarm or the status",
     **{name: f"{STANFORD_COLUMNS[name]} (levels `usable`, alarm limit of the run)" for name in _OF_STANFORD},
     "error": "reason for a missing result",
 }
@@ -230,7 +230,7 @@ def run_benchmark(
 ) -> tuple[pl.DataFrame, tuple[str, ...]]:
     """Run the cases of a folder with one configuration, evaluate railfix and the other programs, and write the tables.
 
-    Return the table (`BENCHMARK_COLUMNS`) and notes. The row of a failed case states the reason of the failure in
+    Return the table (`BENCHMARK_COLUMNS`) and notes. The row of a failed case states the reason for the failure in
     ``error``. Raise InputFileError if a file has a wrong hash, MismatchError if settings were derived from a held-out
     case.
     """

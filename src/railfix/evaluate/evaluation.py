@@ -232,7 +232,7 @@ def _evaluate(
         notes.append("run.json does not state the basis of the protection levels; their kind is unknown")
     stated = folder.table != POSITIONS_TABLE or "protection_status" in folder.positions.columns
     if folder.level_kind is not None and not stated:
-        notes.append("the run has no protection_status: levels count as usable if the status of the position is ok")
+        notes.append("the run has no protection_status: a level counts as usable if the position has status ok")
     notes += [note for antenna in antennas.values() for note in antenna.errors.notes]
     facts = {fact: {name: getattr(antenna, fact) for name, antenna in antennas.items()} for fact in _FACTS}
     run = EvaluatedRun(

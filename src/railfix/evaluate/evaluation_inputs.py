@@ -30,7 +30,7 @@ NEEDED: Final = ("time_gpst", "antenna", "status", "chainage_m", "along_sigma_m"
 NO_MORE: Final = ~cs.all()
 #: Columns of the conventional position.
 CONVENTIONAL: Final = ("conventional_chainage_m", "conventional_x_m", "conventional_y_m", "conventional_z_m")
-#: Name of the table of single-epoch positions; the filter's table ``train`` gets the columns `SINGLE_EPOCH` from it.
+#: Name of the table of single-epoch positions; its columns `SINGLE_EPOCH` are added to the filter's table ``train``.
 POSITIONS_TABLE: Final = "positions"
 TABLES: Final = (POSITIONS_TABLE, "train")
 SINGLE_EPOCH: Final = ("n_used", *CONVENTIONAL)

@@ -1,8 +1,8 @@
 """Comparison of protection levels with errors: Stanford counts, availability, continuity, errors above the level.
 
 Epochs are counted with two choices of protection levels. `usable`: a level is used if the status of the position is ok
-(of the filter: tracking or coasting) and the level raises no alarm; any other position has an infinite level. `all`:
-every level is used, whatever its status.
+(filter: tracking or coasting) and the level raises no alarm; any other position has an infinite level. `all`: every
+level is used, whatever its status.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ _REGIONS: Final = {
 STANFORD_COLUMNS: Final[dict[str, str]] = {
     "grouping": "`all` or `environment`",
     "group": "name of the group",
-    "levels_of": "`usable`: levels of positions with status ok (of the filter: tracking, coasting) and no alarm, other "
-    "levels infinite; `all`: every level",
+    "levels_of": "`usable`: levels without an alarm, of positions with status ok (filter: tracking, coasting); all "
+    "other levels count as infinite; `all`: every level",
     "alarm_limit_m": "alarm limit AL",
     "own_limit": "whether this is the alarm limit of the run",
     "epochs": "number of epochs with a reference, including epochs missing in the log",
@@ -63,13 +63,13 @@ STANFORD_COLUMNS: Final[dict[str, str]] = {
     "available": "epochs with a level within AL, whether or not the error is known",
     "availability": "available / epochs",
     "availability_of_observed": "fraction of the `observed` epochs with a level within AL",
-    "beyond": "errors above a finite level; the number is the same at every AL",
+    "beyond": "errors above a finite protection level; the number is the same at every AL",
     "beyond_share": "beyond / judged",
-    "beyond_blocks": "time blocks (60 s) with an error above a finite level",
+    "beyond_blocks": "time blocks (60 s) with an error above a finite protection level",
     "windows_15_s": "windows of 15 s that begin at an available epoch",
     "kept_15_s": "windows of 15 s in which every epoch is available",
-    "continuity_15_s": "kept_15_s / windows_15_s; not by environment",
-    **dict.fromkeys(("windows_60_s", "kept_60_s", "continuity_60_s"), "as for 15 s, for windows of 60 s"),
+    "continuity_15_s": "kept_15_s / windows_15_s; not computed by environment",
+    **dict.fromkeys(("windows_60_s", "kept_60_s", "continuity_60_s"), "as for 15 s, but with windows of 60 s"),
 }
 
 #: Columns of the list of epochs whose error exceeds the level, with unit and meaning; KIND is the kind of level.

@@ -261,7 +261,7 @@ def _check_same_place(run: RunFolder, antenna: str, answers: Answers) -> None:
     apart = apart[np.isfinite(apart)]
     if len(apart) and (median := float(np.median(apart))) > ANOTHER_PLACE_M:
         raise MismatchError(
-            f"{run.path}: the reference of the {antenna} antenna lies {median / 1000:,.0f} km from its "
+            f"{run.path}: the reference of the {antenna} antenna is {median / 1000:,.0f} km from its "
             "positions; give the reference of this run, and check the order of its coordinates"
         )
 
@@ -349,7 +349,7 @@ def find_trajectory(
         raise faults[0]
     distance = f"{min(farthest):.2f} m" if np.isfinite(min(farthest)) else "the length of the line"
     raise MismatchError(
-        f"{tracks[0]}: is not the track of {run.path}, whose positions of the {antenna} antenna lie up to {distance} "
+        f"{tracks[0]}: is not the track of {run.path}, whose positions of the {antenna} antenna are up to {distance} "
         "from it; give the --track and --vehicle of the run, and its --crs, --height-datum and --geoid if it had any"
     )
 

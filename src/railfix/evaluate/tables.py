@@ -331,7 +331,7 @@ def _stanford(name: str, rows: pl.DataFrame, caption: str, *first: Column) -> Ta
     limits = [f"{limit:g}{' (own)' if its else ''}" for limit, its in zip(rows["alarm_limit_m"], own, strict=True)]
     shown = rows.with_columns(_OF, pl.Series("limit", limits, dtype=pl.String))
     marked = [] if first else [k for k, its in enumerate(own) if its]
-    # a table by environment has only usable levels at the alarm limit of the run
+    # a table by environment counts only usable levels at the run's alarm limit
     columns = _STANFORD[2:] if first else _STANFORD
     return listing(name, shown, [*_where(rows), *first, *columns], caption, marked=marked)
 

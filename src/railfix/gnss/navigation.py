@@ -88,8 +88,8 @@ class KeplerRecords(_NavigationRecords):
     iode: Integers
     iodc: Integers
     data_source: Integers  #: Data source flags (Galileo) or codes on L2 (GPS, QZSS); 0 for BeiDou; shape (n,).
-    #: First and second group delay, shape (n,). GPS and QZSS: TGD and NaN. Galileo: BGD E5a/E1 and BGD E5b/E1. BeiDou:
-    #: TGD1 and TGD2 of D1 and D2, TGD_B1Cp and TGD_B2ap of CNV1 and CNV2, TGD_B2bI and NaN of CNV3.
+    #: First and second group delay, shape (n,). GPS and QZSS: TGD and NaN. Galileo: BGD E5a/E1 and BGD E5b/E1. BeiDou
+    #: D1 and D2: TGD1 and TGD2. CNV1 and CNV2: TGD_B1Cp and TGD_B2ap. CNV3: TGD_B2bI and NaN.
     group_delay_1_s: Floats
     group_delay_2_s: Floats
     #: Inter-signal corrections: GPS/QZSS L1 C/A, L2C, L5I5, L5Q5, L1C_D, L1C_P; BeiDou B1C_D and B2a_D; NaN elsewhere;

@@ -65,7 +65,7 @@ class ReferenceInputs(InputFiles):
     nav: tuple[Path, ...] = input_option("RINEX navigation file, for Doppler speeds; may be repeated.", ())
 
     pulses: Path | None = input_option(
-        "Tachometer table: time_gpst and count or distance_m, otherwise one row per pulse; direction if known.",
+        "Tachometer table: time_gpst with count or distance_m, or one row per pulse; direction is optional.",
         None,
         metavar="CSV",
     )

@@ -47,7 +47,7 @@ ACCELERATION_BIAS_MPS2: Final = 0.05  #: Standard deviation of the accelerometer
 class ReferenceSettings(Settings):
     """Limits and noise of a reference, which are recorded in ``reference.json``."""
 
-    #: Smallest accepted ratio of a fix in the ambiguity test, if the log has the ratio (RTKLIB's default is 3).
+    #: Smallest ratio with which a fix passes the ambiguity test, if the log has ratios (RTKLIB's default is 3).
     ratio: float = _limit("Smallest accepted ambiguity ratio, if the log has ratios.", 3.0, "RATIO", "--ratio")
     #: Largest difference between the measured distance of the two antennas and their distance on the vehicle (P2 3.3: 5
     #: cm).

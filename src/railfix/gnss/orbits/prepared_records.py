@@ -257,7 +257,7 @@ class ChannelRecords:
     #: Indices of the channels with Keplerian records, shape (K,), and of the GLONASS channels, shape (R,).
     kepler: Indices
     glonass: Indices
-    #: Lookup numbers of the message with the signal's clock and delay, and of another message; -1 if absent; (K,).
+    #: Lookup numbers of the preferred message (with the signal's clock and delay) and of the other; -1 if absent; (K,).
     preferred: Integers
     other: Integers
 

@@ -33,7 +33,7 @@ class SatelliteStates:
     #: (`railfix.core.geodesy.range_with_rotation` does that); shape (T, M, 3).
     position_ecef_m: Floats
     velocity_ecef_mps: Floats  #: Derivative of `position_ecef_m` in the same frame, shape (T, M, 3).
-    clock_m: Floats  #: c times the satellite clock with the relativistic correction, without group delay; shape (T, M).
+    clock_m: Floats  #: Satellite clock times c, with the relativistic correction and without group delay; (T, M).
     #: Group delay of the channel's signal: corrected code = code + clock_m - group_delay_m - delays. NaN on signals
     #: whose delay is not broadcast (`prepared_records.group_delay_s`); shape (T, M).
     group_delay_m: Floats
@@ -93,8 +93,8 @@ def satellite_states(
     max_age_s : float, optional
         Limit on the time between epoch and toe, in addition to the validity of the records [s].
     record : ndarray of int, shape (T, M), optional
-        Rows of `navigation.kepler` to use, because corrections refer to one issue of data (`issue_records`); -1 for the
-        usual selection. A satellite is also unhealthy if the usual record flags it. Ignored for GLONASS.
+        Rows of `navigation.kepler` to use if corrections refer to one issue of data (`issue_records`); -1 to select as
+        usual. A satellite is also unhealthy if the record that is usually selected flags it. Ignored for GLONASS.
 
     Raises
     ------
