@@ -1,9 +1,8 @@
-"""Functions on arrays, compiled with numba, for the filter along the track and for the single-epoch stages.
+"""Numba-compiled functions on arrays for the along-track filter and for single-epoch positioning.
 
-A module of this package is imported when one of its functions is first used (``kernels.ranges.misfits``), because numba
-takes half a second to load. The functions operate only on arrays and numbers. The modules import nothing of railfix
-except this package and `railfix.core`. With ``NUMBA_DISABLE_JIT=1``, the functions are plain Python, for a debugger and
-for tests.
+A module of this package is imported when one of its functions is first used, because numba takes half a second to load.
+The functions operate only on arrays and numbers. The modules import only this package and `railfix.core` from railfix.
+With ``NUMBA_DISABLE_JIT=1`` in the environment, the functions are plain Python, for a debugger and for tests.
 """
 
 from __future__ import annotations
@@ -17,12 +16,12 @@ if TYPE_CHECKING:
 
 __all__ = ["hypotheses", "level", "model", "off_tangent", "ranges", "reading", "robust", "screens", "search", "windows"]
 
-#: Modules that have the kernels of the filter along the track.
+#: Modules with the kernels of the along-track filter.
 _FILTER_MODULES: Final = ("tracking.recursion", "tracking.velocity")
 
 
 def __getattr__(name: str) -> Any:
-    """Import a module of kernels at its first use."""
+    """Import a kernel module at its first use."""
     if name not in __all__:
         raise AttributeError(f"module 'railfix.kernels' has no attribute {name!r}")
     return import_module(f"railfix.kernels.{name}")
@@ -41,19 +40,19 @@ def _import_all() -> Any:
 
 
 def load() -> None:
-    """Load the machine code of all kernels now, so that loading delays no epoch."""
+    """Load the machine code of all kernels in advance, so that loading does not delay an epoch."""
     _import_all().load()
 
 
 def is_compiled() -> bool:
-    """Return whether the machine code of all kernels is on this machine.
+    """Return True if the machine code of all kernels is stored on this machine.
 
-    Other kernels are compiled at the first call.
+    Kernels without stored machine code are compiled at their first call.
     """
     compiled: bool = _import_all().is_compiled()
     return compiled
 
 
 def record_compiled() -> None:
-    """Record that this process has compiled all kernels, and with which argument types."""
+    """Record that this process has compiled all kernels, and the argument types used."""
     _import_all().record_compiled()

@@ -1,8 +1,8 @@
-"""Compilation with numba, with the machine code cached on disk.
+"""Compilation with numba, and cache of the machine code on disk.
 
-The cache is in ``NUMBA_CACHE_DIR``, or else in the source folder, or in the user's cache folder if that is not
-writable. numba recompiles a function when its own file changes; `_remove_outdated` checks the files of called
-functions.
+The cache is in ``NUMBA_CACHE_DIR`` if it is set, otherwise in the source folder, or in the user's cache folder if the
+source folder is not writable. numba recompiles a function only when the file of this function changes.
+`_remove_outdated` therefore checks the files of called functions.
 """
 
 from __future__ import annotations
@@ -27,29 +27,28 @@ from railfix.core.staged_files import stage_file
 Function = TypeVar("Function", bound=Callable[..., Any])
 #: Compiled functions of the imported modules.
 COMPILED: Final[list[Any]] = []
-#: Options of numba: divisions by zero give infinity or NaN, as in numpy, and multiply-add operations may be fused.
+#: Options of numba: divisions by zero result in infinity or NaN, as in numpy, and multiply-adds may be fused.
 OPTIONS: Final[dict[str, Any]] = {"nogil": True, "error_model": "numpy", "fastmath": {"contract"}}
 _PACKAGE: Final = Path(__file__).parent
 
 
 def is_plain() -> bool:
-    """Return whether kernels are not compiled, but stay plain Python."""
+    """Return True if kernels remain plain Python."""
     return os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
 
 
 def kernel(function: Function) -> Function:
-    """Compile a function on arrays at its first call, without the interpreter lock, and cache the machine code on disk.
+    """Compile a function on arrays at its first call, to run without the interpreter lock, and cache the machine code.
 
-    With ``NUMBA_DISABLE_JIT=1``, the function stays plain Python.
+    With ``NUMBA_DISABLE_JIT=1``, the function remains plain Python.
 
     Raises
     ------
     SettingsError
-        No cache folder is writable.
+        If no cache folder is writable.
     """
     if is_plain():
-        # Integer overflow, division by zero and NaN are intended; like machine code, plain Python does not warn about
-        # them.
+        # Integer overflow, division by zero and NaN are intended: no warnings, as in machine code.
         return np.errstate(all="ignore")(function)
     try:
         compiled = numba.njit(cache=True, **OPTIONS)(function)
@@ -64,16 +63,16 @@ def kernel(function: Function) -> Function:
 
 
 def inner(function: Function) -> Function:
-    """Compile a function that only kernels call; the machine code becomes part of the calling kernels."""
+    """Compile a function that only kernels call, as part of the calling kernels."""
     if is_plain():
         return function
     return cast(Function, numba.njit(**OPTIONS)(function))
 
 
 def inlined(function: Function) -> Function:
-    """Compile a small function of an inner loop into its callers (`inline` of numba).
+    """Compile a small function into its callers (`inline` of numba).
 
-    An ordinary call counts the references to each array argument, which takes longer than a small function.
+    An ordinary call counts references to array arguments, which takes longer than the small function itself.
     """
     if is_plain():
         return function
@@ -82,7 +81,7 @@ def inlined(function: Function) -> Function:
 
 @cache
 def _files(package: Path, module: str) -> set[Path]:
-    """Return the file of a module of this package, or the files of a subpackage, with the files of all imports."""
+    """Return the files of a module or subpackage of this package, and the files of this package that it imports."""
     path = package / f"{module.replace('.', '/')}.py"
     if not path.exists():
         return set(path.with_suffix("").glob("*.py"))
@@ -92,7 +91,7 @@ def _files(package: Path, module: str) -> set[Path]:
 
 @cache
 def _tuples(package: Path) -> bytes:
-    """Return all named tuples by file, because numba cannot load cached code for a tuple class that has moved."""
+    """Return the names of all named tuples by file; numba cannot load cached code for a tuple class that has moved."""
     named = re.compile(rb"^class \w+\(NamedTuple\)", re.MULTILINE)
     files = ((path, named.findall(path.read_bytes())) for path in sorted(package.parent.rglob("*.py")))
     return b"\n".join(
@@ -102,14 +101,14 @@ def _tuples(package: Path) -> bytes:
 
 @cache
 def compute_stamp(package: Path, module: str) -> str:
-    """Return the hash of all that a module's machine code depends on: source files, constants and names of tuples."""
+    """Return a hash of the source files, constants and names of tuples on which a module's machine code depends."""
     files = [*sorted(_files(package, module)), package.parent / "core" / "constants.py"]
     return hashlib.sha256(b"".join([*(path.read_bytes() for path in files), _tuples(package)])).hexdigest()
 
 
 @cache
 def _remove_outdated(folder: Path, module: str) -> None:
-    """Remove a module's machine code from a numba cache folder if it was compiled from other sources."""
+    """Remove a module's machine code from a numba cache folder if it was compiled from different sources."""
     stamp, file = compute_stamp(_PACKAGE, module), folder / f"{module}.sha256"
     if file.exists() and file.read_text(encoding="ascii") == stamp:
         return
@@ -132,7 +131,7 @@ def _name(function: Any) -> str:
 
 
 def _record_file() -> Path:
-    """Return the path of the record of argument types for which all kernels of these sources have been compiled."""
+    """Return the path of the record of argument types for the present sources of all kernels."""
     modules = sorted({function.py_func.__module__.removeprefix("railfix.kernels.") for function in COMPILED})
     stamps = [compute_stamp(_PACKAGE, module) for module in modules]
     name = hashlib.sha256("".join([*stamps, numba.__version__, sys.version]).encode()).hexdigest()
@@ -141,7 +140,7 @@ def _record_file() -> Path:
 
 def record_compiled() -> None:
     """Record the argument types for which this process has compiled the kernels."""
-    if not COMPILED:  # the kernels stay plain Python
+    if not COMPILED:  # the kernels remain plain Python
         return
     file = _record_file()
     for earlier in file.parent.glob("compiled-*.pickle"):
@@ -151,12 +150,12 @@ def record_compiled() -> None:
 
 
 def is_compiled() -> bool:
-    """Return whether all kernels of these sources have been compiled on this machine, or stay plain Python."""
+    """Return True if all kernels of these sources have been compiled on this machine, or remain plain Python."""
     return not COMPILED or _record_file().exists()
 
 
 def load() -> None:
-    """Load the machine code of all kernels; kernels without machine code are compiled when they are first called."""
+    """Load the machine code of all kernels if it is complete; otherwise, kernels are compiled at their first call."""
     if not COMPILED or not is_compiled():
         return
     types = pickle.loads(_record_file().read_bytes())

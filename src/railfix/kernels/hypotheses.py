@@ -1,4 +1,4 @@
-"""Effect of each fault hypothesis on the position error."""
+"""Distribution of the position error under each fault hypothesis."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from railfix.kernels.level_equations import (
 
 
 class _Tails(NamedTuple):
-    """Offset, sigma and weight of the error for all hypotheses (T, K); ratio of separation to threshold (K,)."""
+    """Offset, sigma and weight of the error for K hypotheses, shape (T, K); separation over threshold, shape (K,)."""
 
     offset: Floats
     sigma: Floats
@@ -36,13 +36,13 @@ class _Tails(NamedTuple):
 
 
 class _Work(NamedTuple):
-    """Inputs for the hypotheses of one base (a shared fault): channels of the base, and the system without these
-    channels.
+    """Work arrays for the hypotheses with one shared fault (base), and with further faulty channels.
 
-    `others`: fault priors of the other channels (n,). `removed`: effect of the base (4,). `own`: work space (n,). The
-    other fields are indexed by the number of channels left out so far: remaining system `reduced` (2, n + 4, n), effect
-    `taken` (3, 4), whether a fault is `undetectable`, next channel (`start`), output index (`place`), `product` of
-    priors (3,).
+    `member` are the channels of the base, shape (n,), and `rows` the system without them, shape (n + 4, n). `others`
+    are the fault priors of the other channels, shape (n,). `removed` is the effect of the base, shape (4,). `single`
+    and `own` are work space, shape (n,). The other fields are indexed by the number of further excluded channels:
+    system `reduced` without these channels, shape (2, n + 4, n), effect `taken`, shape (3, 4), and, with shape (3,),
+    the flag `undetectable`, the next channel `start`, the output index `place`, and the `product` of priors.
     """
 
     member: Masks
@@ -60,7 +60,7 @@ class _Work(NamedTuple):
 
 
 class _Sets(NamedTuple):
-    """Offset, sigma, and ratio of separation to threshold, for sets of excluded channels, in order."""
+    """Offset, sigma, and ratio of separation to threshold for consecutive sets of excluded channels."""
 
     offset: Floats
     sigma: Floats
@@ -69,10 +69,10 @@ class _Sets(NamedTuple):
 
 @inner
 def _downdate(rows: Floats, member: Masks, every: bool, limit: float, work: Floats, removed: Floats) -> bool:
-    """Leave out channels in sequence; return whether a fault of these channels is undetectable.
+    """Exclude the channels `member` one after another; return True if their fault is undetectable.
 
-    `removed` gets the effect of the channels, and `work` the rows of the remaining system, with `every` of all
-    channels.
+    The effect of the channels is written to `removed`, and the remaining system to `work`. The rows of channels in
+    `work` are complete only if `every` is True.
     """
     n, undetectable = rows.shape[1], False
     for i in range(n + 4):
@@ -109,9 +109,9 @@ def _with_each_later(
     ranges: RangeErrors,
     sets: _Sets,
 ) -> None:
-    """Write the results for each pair of channel i and a later channel that are left out from the system `rows`.
+    """Write the results of excluding channel i and one later channel from the system `rows`, for each later channel.
 
-    `removed` and `undetectable` describe the channels that were left out before.
+    `removed` and `undetectable` describe the channels that were excluded before.
     """
     n, own, limit = rows.shape[1], ranges.own, common[LIMIT]
     offset, sigma, ratio = sets.offset, sets.sigma, sets.ratio
@@ -141,17 +141,17 @@ def _with_each_later(
 
 @kernel
 def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, Floats, Floats, Floats, Floats]:
-    """Return the error distribution of all hypotheses for a block of epochs.
+    """Return the position error distribution of all hypotheses for a block of epochs.
 
     Returns
     -------
     channel : ndarray of int, shape (T, n)
-        Indices of the channels; channels in use come first.
+        Indices of the channels, with channels in use first.
     offset_m, sigma_m, weight : ndarray, shape (T, K)
-        Arguments of `level.solve_level`: threshold plus bias, sigma (infinite for undetectable faults), prior
-        probability.
+        Arguments of `level.solve_level`. The offset is threshold plus bias. Sigma is infinite for undetectable faults.
+        The weight is the prior probability.
     separation : ndarray, shape (T,)
-        `ProtectionLevel.separation`.
+        Field of `ProtectionLevel`.
     """
     epochs, n = len(model.root_weight), 0
     for t in range(epochs):
@@ -188,7 +188,7 @@ def tails_of_hypotheses(model: Any, errors: Any, asked: Any) -> tuple[Indices, F
 
 @inner
 def _new_work(n: int) -> _Work:
-    """Allocate the work arrays for the hypotheses of one base."""
+    """Allocate the work arrays."""
     return _Work(
         np.empty(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_), np.empty(n), np.zeros(4), np.empty(n),
         np.empty((n + 4, n)), np.empty((2, n + 4, n)), np.zeros((3, 4)), np.zeros(3, dtype=np.bool_),
@@ -207,7 +207,7 @@ def _write_base(
     work: _Work,
     tails: _Tails,
 ) -> None:
-    """Write the hypotheses of the base `at` (epoch, base): the shared fault alone, and with further faulty channels."""
+    """Write the hypotheses of base `at` (epoch, base): the shared fault alone, and with further faulty channels."""
     (t, base), n, rows = at, len(channels.root), system.rows
     order, first, prior = asked.order[t, base], asked.first[base], asked.shared_prior[t, base]
     some = False
@@ -223,7 +223,7 @@ def _write_base(
         rows = work.rows
     more = of_ranges(rows[n], ranges) if ranges.any else (0.0, 0.0, 0.0)
     _write_one(t, first[0], work.removed, more, undetectable, system.common, tails)
-    tails.weight[t, first[0]] = prior * (2.0 if first[0] == 0 else 1.0)  # noise exceeds the level on either side
+    tails.weight[t, first[0]] = prior * (2.0 if first[0] == 0 else 1.0)  # two-sided: noise of either sign
     if order > 0:
         _write_singles(t, first[1], System(rows, system.common), ranges, undetectable, work, tails)
         for i in range(n):
@@ -244,7 +244,7 @@ def _write_one(
     common: Floats,
     tails: _Tails,
 ) -> None:
-    """Write a hypothesis from the effect of the excluded channels; an undetectable fault gives an unbounded error."""
+    """Write a hypothesis from the effect of the excluded channels; the error of an undetectable fault is unbounded."""
     tails.offset[t, at], tails.sigma[t, at], tails.ratio[at] = separate(
         removed[0], removed[1], removed[2], removed[3], more, common
     )
@@ -256,7 +256,7 @@ def _write_one(
 def _write_singles(
     t: int, at: int, system: System, ranges: RangeErrors, undetectable: bool, work: _Work, tails: _Tails
 ) -> None:
-    """Write the hypotheses in which one further channel is left out, from index `at` on."""
+    """Write the hypotheses in which one further channel is excluded, from index `at` on."""
     rows, n, limit, removed, whole = system.rows, len(work.own), system.common[LIMIT], np.empty(4), (0.0, 0.0, 0.0)
     if ranges.any:
         whole = of_ranges(rows[n], ranges)
@@ -276,7 +276,7 @@ def _write_singles(
 
 @inner
 def _write_together(t: int, order: int, system: System, ranges: RangeErrors, work: _Work, tails: _Tails) -> None:
-    """Write the sets of two and more channels; the last two channels are left out together, all others one by one."""
+    """Write the hypotheses with two and more further channels; the last two are excluded together."""
     n, limit, depth = len(work.own), system.common[LIMIT], 0
     while depth >= 0:
         i = work.start[depth]

@@ -1,4 +1,4 @@
-"""Protection level at which the Gaussian tails of many hypotheses sum to the allowed risk."""
+"""Protection level at which the Gaussian tails of all fault hypotheses sum to the allowed risk."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ import numpy as np
 from railfix.core.arrays import Codes, Floats, Indices
 from railfix.kernels.compiling import inner, kernel
 
-#: Relative step size below which the next level is exact to 1e-6; the step to it is the last.
+#: Relative size of the last step, after which the level is exact to 1e-6.
 _CLOSE = 5e-4
-#: Largest number of steps; without convergence, the lowest level found within the risk is used.
+#: Largest number of steps; without convergence, the lowest level within the risk is used.
 _STEPS = 60
-#: Number of the step from which every second step bisects the bracket, because steps can alternate between two points.
+#: From this step on, every second step bisects the bracket, because steps can alternate between two levels.
 _HALVING = 8
-#: Fraction of the risk that is left unused.
+#: Fraction of the risk that is not used.
 _AIM = 0.002
-#: Relative difference below which two hypotheses require the same level; the first of them is reported.
+#: Relative difference below which two required levels count as equal; the first hypothesis is then reported.
 _ALIKE = 1e-9
-#: a, b: for x >= 0, Q(x) is the density over ``(1 - a) x + a sqrt(x^2 + b)`` to 0.3 % (Borjesson and Sundberg 1979).
+#: a and b: for x >= 0, the Mills ratio is ``1 / ((1 - a) x + a sqrt(x^2 + b))`` to 0.3 % (Borjesson, Sundberg 1979).
 _MILLS = (0.339, 5.510)
 _TINY = float(np.finfo(np.float64).tiny)
 _ROOT_TWO_PI = math.sqrt(2.0 * math.pi)
@@ -35,8 +35,8 @@ _Q = (
     1.0, 1.32281951154744992508e1, 8.67072140885989742329e1, 3.54937778887819891062e2, 9.75708501743205489753e2,
     1.82390916687909736289e3, 2.24633760818710981792e3, 1.65666309194161350182e3, 5.57535340817727675546e2,
 )  # fmt: skip
-#: exp(x) = 2^k exp(r), |r| <= ln 2 / 2: log2(e), ln 2 in two parts, and the constant that shifts k + 1023 into the
-#: lowest bits.
+#: Constants of exp(x) = 2^k exp(r) with |r| <= ln 2 / 2: log2(e), ln 2 in two parts, and the constant that shifts k +
+#: 1023 into the lowest bits.
 _LOG2_E, _LN2_HIGH, _LN2_LOW = 1.4426950408889634, 6.93147180369123816490e-01, 1.90821492927058770002e-10
 _SHIFT = 6755399441055744.0 + 1023.0
 _E = tuple(1.0 / math.factorial(k) for k in range(12))
@@ -44,7 +44,7 @@ _E = tuple(1.0 / math.factorial(k) for k in range(12))
 
 @inner
 def _mills(x: float) -> float:
-    """Return the Mills ratio at x >= 0, that is, the Gaussian tail divided by the density."""
+    """Return the Mills ratio at x >= 0, which is the Gaussian tail divided by the density."""
     y = x * _ROOT_HALF
     p = (((((((_P[0] * y + _P[1]) * y + _P[2]) * y + _P[3]) * y + _P[4]) * y + _P[5]) * y + _P[6]) * y + _P[7]) * y
     q = (((((((_Q[0] * y + _Q[1]) * y + _Q[2]) * y + _Q[3]) * y + _Q[4]) * y + _Q[5]) * y + _Q[6]) * y + _Q[7]) * y
@@ -53,7 +53,7 @@ def _mills(x: float) -> float:
 
 @inner
 def _bells(z: Floats, bits: Indices, out: Floats) -> None:
-    """Write exp(-z^2/2) into `out`; `bits` is a view of another array of the same length. The loops are vectorised."""
+    """Write exp(-z^2/2) into `out` by vectorised loops; `bits` is work space of the same length."""
     scratch = bits.view(np.float64)
     for m in range(len(z)):
         u = max(-0.5 * z[m] * z[m], -700.0)
@@ -71,7 +71,7 @@ def _bells(z: Floats, bits: Indices, out: Floats) -> None:
 
 @inner
 def _quantile(probability: float) -> float:
-    """Return the value that a standard normal variable exceeds with a probability, as `one_sided_k` does."""
+    """Return the value that a standard normal variable exceeds with a given probability (`one_sided_k`)."""
     if probability >= 1.0:
         return -np.inf
     if not probability > 0.0:
@@ -90,8 +90,8 @@ def _quantile(probability: float) -> float:
 
 
 class _Room(NamedTuple):
-    """Work space of an epoch. For each hypothesis (K,): inverse sigma, weight (0 if undetectable), required level,
-    sigmas to the level, exp(-z^2/2) and tail; for each kind of hypothesis, the sum of the tails.
+    """Work space of an epoch. Fields of hypotheses, shape (K,), are inverse sigma, weight (0 if undetectable), required
+    level, distance z to the level in sigmas, exp(-z^2/2) and tail. `of_kind` is the sum of tails per kind.
     """
 
     inverse: Floats
@@ -108,34 +108,33 @@ class _Room(NamedTuple):
 def solve_level(
     offset_m: Floats, sigma_m: Floats, weight: Floats, bounds: Indices, share: Floats, reserved: Floats
 ) -> tuple[Floats, Codes, Floats, Floats, Indices]:
-    """Find the level at which the summed tails of all hypotheses, ``weight Q((L - offset)/sigma)``, stay within the
-    risk.
+    """Find the level L at which the sum of ``weight Q((L - offset)/sigma)`` over all hypotheses is within the risk.
 
-    Undetectable faults use risk equal to their full weight; the remaining risk is for checked faults. Divided among the
-    kinds of hypotheses, the risk requires a level for each kind. The largest of these levels is lowered in steps until
-    the sum of the tails reaches 0.998 of the risk.
+    Undetectable faults use risk equal to their weight; detectable faults use the remaining risk. If each kind of
+    hypothesis may use its `share`, it requires a certain level. The largest of these levels is lowered until the sum of
+    the tails reaches 0.998 of the remaining risk.
 
     Parameters
     ----------
     offset_m, sigma_m, weight : ndarray, shape (T, K)
         Hypotheses, grouped by kind; `sigma_m` is infinite for undetectable faults, `weight` is 0 for unused entries.
     bounds : ndarray of int, shape (kinds + 1,)
-        Index of the first hypothesis of each kind, followed by K.
+        Index of the first hypothesis of each kind, and K at the end.
     share : ndarray, shape (T, kinds)
         Risk that each kind may use.
     reserved : ndarray, shape (T,)
-        Risk subtracted from the sum of `share` beforehand.
+        Risk that is subtracted from the sum of `share`.
 
     Returns
     -------
     level_m : ndarray, shape (T,) [m]
     spender : ndarray of int8, shape (T,)
-        Kind of hypothesis that uses most of the risk at that level.
+        Kind of hypothesis that uses most of the risk at `level_m`.
     part_m, k : ndarray, shape (T, kinds)
-        Largest ``offset + k sigma`` of each kind; 0, with k = -inf, where the total weight of the kind is within its
-        `share`.
+        Level ``offset + k sigma`` that each kind requires. If the total weight of a kind is within its `share`, the
+        level is 0, and k is -inf.
     worst : ndarray of int, shape (T, kinds)
-        Index within the kind of the hypothesis that requires `part_m`; -1 if there is none.
+        Index, within its kind, of the hypothesis that requires `part_m`; -1 without such a hypothesis.
     """
     (epochs, width), kinds = weight.shape, len(bounds) - 1
     level, spender = np.zeros(epochs), np.zeros(epochs, dtype=np.int8)
@@ -169,7 +168,7 @@ def solve_level(
 def _require(
     offset: Floats, sigma: Floats, prior: Floats, checked: Floats, share: float, required: Floats
 ) -> tuple[float, float, float, int]:
-    """Return, for one kind, the risk left for checked faults, k, the largest required level, and the index of it."""
+    """Return for one kind the remaining risk, k, the largest required level, and the hypothesis that requires it."""
     total, whole = 0.0, 0.0
     for m in range(len(prior)):
         total += checked[m]
@@ -196,7 +195,7 @@ def _require(
 
 @inner
 def _lower(offset: Floats, bounds: Indices, highest: float, aim: float, room: _Room) -> tuple[float, int]:
-    """Return the level at which the tails sum to `aim`, by steps from `highest`, and the kind with the largest sum."""
+    """Return the level at which the tails sum to `aim`, found from `highest` on, and the kind with the largest sum."""
     level, spender, here, below, above = highest, 0, highest, 0.0, highest
     for number in range(_STEPS):
         _write_tails(offset, here, number == 0, room)
@@ -220,7 +219,7 @@ def _lower(offset: Floats, bounds: Indices, highest: float, aim: float, room: _R
 
 @inner
 def _write_tails(offset: Floats, level: float, roughly: bool, room: _Room) -> None:
-    """Write the tail of each hypothesis beyond a level: weight times Q, which is exact to 0.3 % if `roughly` is set."""
+    """Write the tail of each hypothesis beyond a level, weight times Q; with `roughly`, Q is exact to 0.3 % only."""
     for m in range(len(offset)):
         room.z[m] = (offset[m] - level) * room.inverse[m]
     _bells(room.z, room.bits, room.bell)
@@ -237,7 +236,7 @@ def _write_tails(offset: Floats, level: float, roughly: bool, room: _Room) -> No
 
 @inner
 def _step(bounds: Indices, here: float, highest: float, aim: float, room: _Room) -> tuple[float, float]:
-    """Return the logarithm of summed tails over `aim`, and the next level, from the derivatives of the logarithm."""
+    """Return the logarithm of (sum of tails / `aim`), and the next level, computed from its derivatives."""
     total, slope, bend = 0.0, 0.0, 0.0
     for kind in range(len(room.of_kind)):
         room.of_kind[kind] = 0.0

@@ -1,4 +1,4 @@
-"""Equations of an epoch for fault hypotheses: channels, and the channels' projector, gains and residuals."""
+"""Equations of an epoch for fault hypotheses: projector, gains and residuals of the channels."""
 
 from __future__ import annotations
 
@@ -10,36 +10,36 @@ import numpy as np
 from railfix.core.arrays import Floats, Indices
 from railfix.kernels.compiling import inner
 
-#: Effect of a satellite on the position, in position sigmas, below which the effect is taken as zero.
+#: Smallest effect of a satellite on the position, in position sigmas; smaller effects are taken as zero.
 _NO_EFFECT = 1e-6
-#: Separation, as a fraction of sigma, below which the separation is taken as zero.
+#: Smallest separation, as a fraction of sigma; smaller separations are taken as zero.
 _SAME = 1e-9
-#: Entries of `System.common`: squared noise scale, variance of the distance, response of the position to map errors
-#: across and up, mean map error across and up, false-alarm threshold in sigmas, smallest threshold, flag of equations
-#: without the map, distance of the position without the map, and gain below which a channel has no effect.
+#: Entries of `System.common`: squared noise scale, variance along the line, response of the position to map errors
+#: across and up, mean map errors across and up, false-alarm threshold in sigmas, smallest tested threshold, 1 for
+#: equations without the map, displacement of the position without the map, smallest gain with an effect.
 _NOISE, _VARIANCE, _MAP_ACROSS, _MAP_UP, _BIAS_ACROSS, _BIAS_UP, _K, _LEAST, _FREE, _SHIFT, LIMIT = range(11)
 
 
 class Channels(NamedTuple):
-    """Contiguous arrays of one epoch's channels, shape (n,); channels in use come first, the others have zeros."""
+    """Contiguous arrays of one epoch's channels, shape (n,), with channels in use first and zeros for the others."""
 
-    number: Indices  #: Index of the channel in the model.
-    root: Floats  #: Root of the channel's weight [1/m].
+    number: Indices  #: Index of each channel in the model.
+    root: Floats  #: Root of the weight [1/m].
     clock: Indices
     along: Floats  #: Whitened design.
     across: Floats
     up: Floats
-    prior: Floats  #: Prior probability of a fault of the channel.
-    bias: Floats  #: Mean error, whitened.
-    beyond: Floats  #: Variance in addition to the noise, whitened.
-    shared: Floats  #: Covariance of two channels due to their clocks; shape (n, n).
+    prior: Floats  #: Prior fault probability of each channel.
+    bias: Floats  #: Whitened mean error.
+    beyond: Floats  #: Whitened variance in addition to the noise.
+    shared: Floats  #: Whitened covariance of each two channels due to clocks, shape (n, n).
 
 
 class System(NamedTuple):
     """Equations of one epoch.
 
-    `rows`: projector of the channels, and below it the channels' gains, residuals, and responses to map errors across
-    and up; shape (n + 4, n). `common`: values that are the same for all channels; shape (11,).
+    `rows`, shape (n + 4, n), is the projector of the channels, followed by the rows of gains, residuals, and responses
+    to map errors across and up. `common`, shape (11,), has the values common to all channels.
     """
 
     rows: Floats
@@ -47,7 +47,7 @@ class System(NamedTuple):
 
 
 class _Fit(NamedTuple):
-    """Misfits summed by clock (C,) and by axis (3,), and the steps of position and clocks that the sums imply."""
+    """Misfits summed by clock, shape (C,), and by axis, shape (3,), and the implied steps of position and clocks."""
 
     by_clock: Floats
     by_axis: Floats
@@ -56,9 +56,9 @@ class _Fit(NamedTuple):
 
 
 class RangeErrors(NamedTuple):
-    """Errors of single ranges in addition to the noise, if there are `any`: `bias`, and variance `beyond`.
+    """Additional errors of single ranges: `bias` and variance `beyond`; `any` is True if there are such errors.
 
-    `gain` is the gain of the ranges before exclusions; `own` is work space for gains after exclusions.
+    `gain` has the gains of the ranges before exclusions. `own` is work space for gains after exclusions.
     """
 
     any: bool
@@ -70,7 +70,7 @@ class RangeErrors(NamedTuple):
 
 @inner
 def of_ranges(left: Floats, ranges: RangeErrors) -> tuple[float, float, float]:
-    """Return what the gains `left` of single ranges contribute to bias, variance of the separation, and variance."""
+    """Return bias, separation variance and position variance that range errors cause with the gains `left`."""
     bias, apart, total = 0.0, 0.0, 0.0
     for m in range(len(left)):
         bias += abs(left[m]) * ranges.bias[m]
@@ -83,7 +83,7 @@ def of_ranges(left: Floats, ranges: RangeErrors) -> tuple[float, float, float]:
 def separate(
     square: float, distance: float, across: float, up: float, more: tuple[float, float, float], common: Floats
 ) -> tuple[float, float, float]:
-    """Return offset, sigma, and ratio of separation to threshold, from the effect of a set of excluded channels."""
+    """Return offset, sigma, and ratio of separation to threshold for the effect of a set of excluded channels."""
     noise, whole_across, whole_up = common[_NOISE], across + common[_MAP_ACROSS], up + common[_MAP_UP]
     apart = noise * square + (1.0 - noise) * (across * across + up * up)
     whole = whole_across * whole_across + whole_up * whole_up
@@ -107,7 +107,7 @@ def new_channels(n: int) -> Channels:
 
 @inner
 def new_fit(clocks: int) -> _Fit:
-    """Allocate the arrays for the sums of the misfits."""
+    """Allocate the arrays for sums of misfits."""
     return _Fit(np.empty(clocks), np.empty(3), np.empty(3), np.empty(clocks))
 
 
@@ -127,7 +127,7 @@ def choose_channels(root: Floats, number: Indices) -> None:
 
 @inner
 def write_channels(model: Any, errors: Any, prior: Floats, t: int, channels: Channels) -> None:
-    """Write the data of one epoch's channels contiguously, in the order of `channels.number`."""
+    """Write one epoch's channel data in the order of `channels.number`."""
     n = len(channels.number)
     for i in range(n):
         m = channels.number[i]
@@ -151,7 +151,7 @@ def write_channels(model: Any, errors: Any, prior: Floats, t: int, channels: Cha
 
 @inner
 def fit_misfits(model: Any, t: int, channels: Channels, fit: _Fit) -> None:
-    """Sum the misfits by clock and axis, and write the step of position and clocks that they imply."""
+    """Sum the misfits by clock and axis, and write the implied steps of position and clocks."""
     fit.by_clock[:] = 0.0
     fit.by_axis[:] = 0.0
     for i in range(len(channels.root)):
@@ -173,7 +173,7 @@ def fit_misfits(model: Any, t: int, channels: Channels, fit: _Fit) -> None:
 
 @inner
 def _spread(channels: Channels, i: int, covariance: Floats) -> tuple[float, float, float]:
-    """Return the product of the position covariance and the design vector of a channel."""
+    """Return the product of a channel's design vector and the position covariance."""
     x, y, z = channels.along[i], channels.across[i], channels.up[i]
     return (
         x * covariance[0, 0] + y * covariance[1, 0] + z * covariance[2, 0],
@@ -184,7 +184,7 @@ def _spread(channels: Channels, i: int, covariance: Floats) -> tuple[float, floa
 
 @inner
 def _write_projector(channels: Channels, covariance: Floats, rows: Floats) -> None:
-    """Write the projector of the channels, computed with the position covariance, and below it the channels' gains."""
+    """Write the projector of the channels for a position covariance, and the row of gains below the projector."""
     n = len(channels.root)
     for i in range(n):
         along, across, up = _spread(channels, i, covariance)
@@ -220,7 +220,7 @@ def write_with_map(model: Any, errors: Any, k: float, t: int, channels: Channels
 def write_without_map(
     model: Any, errors: Any, t: int, channels: Channels, fit: _Fit, with_map: System, system: System
 ) -> bool:
-    """Write the equations without the map, and return whether they determine a position.
+    """Write the equations without the map, and return True if they determine a position.
 
     Offsets include the full distance between the positions without and with the map, and separations are not tested.
     """
@@ -246,7 +246,7 @@ def write_without_map(
 
 @inner
 def _without_map(covariance: Floats, prior: Floats, information: Floats, scale: float) -> tuple[Floats, bool]:
-    """Return the position covariance with `information` in place of the prior from the map, and whether it exists."""
+    """Return the position covariance with `information` instead of the map's prior, and True if it exists."""
     normal, regular = _inverse(covariance)
     for a in range(3):
         for b in range(3):
@@ -265,7 +265,7 @@ def _without_map(covariance: Floats, prior: Floats, information: Floats, scale: 
 
 @inner
 def _inverse(matrix: Floats) -> tuple[Floats, bool]:
-    """Return the inverse of a symmetric 3 x 3 matrix, and whether the matrix scaled to a unit diagonal is regular."""
+    """Return the inverse of a symmetric 3 x 3 matrix, and True if the matrix scaled to a unit diagonal is regular."""
     inverse, unit = np.empty((3, 3)), np.empty(3)
     for a in range(3):
         if not matrix[a, a] > 0.0:

@@ -1,4 +1,4 @@
-"""Linearisation and whitening of ranges at a position, with the clocks eliminated, and residuals of the ranges."""
+"""Linearisation and whitening of ranges at a position with the clocks eliminated, and residuals of the ranges."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from railfix.kernels.sight import sight
 
 @inner
 def _write_clock_covariance(totals: Floats, tie_sigma_m: Floats, rho: Floats, covariance: Floats) -> None:
-    """Write the covariance of the clocks of one epoch at a known position, shape (G, G).
+    """Write the covariance of one epoch's clocks at a known position, shape (G, G).
 
-    A separate clock has the variance 1/T, where T is the summed weight of its satellites. Clocks whose offset from a
-    common clock is known to sigma have ``diag(sigma^2 rho) + rho rho^T / sum(T rho)`` with ``rho = 1/(1 + sigma^2 T)``.
-    Clocks without satellites get 0.
+    T is the summed weight of a clock's satellites. A separate clock has the variance 1/T. Clocks whose offset from a
+    common clock is known with the standard deviation sigma have the covariance ``diag(sigma^2 rho) + rho rho^T / sum(T
+    rho)``, with ``rho = 1/(1 + sigma^2 T)``. Clocks without satellites have the covariance 0.
     """
     groups, mass = len(totals), 0.0
     if not len(tie_sigma_m):
@@ -38,7 +38,7 @@ def _write_clock_covariance(totals: Floats, tie_sigma_m: Floats, rho: Floats, co
 
 @inner
 def _invert_scaled(matrix: Floats, scale: Floats, inverse: Floats) -> None:
-    """Invert a symmetric 3 x 3 matrix, which is scaled to a unit diagonal in place; NaN if it is singular."""
+    """Invert a symmetric 3 x 3 matrix; NaN if it is singular. `matrix` is scaled to a unit diagonal in place."""
     for i in range(3):
         scale[i] = 1.0 / math.sqrt(matrix[i, i]) if matrix[i, i] > 0.0 else math.nan
     for i in range(3):
@@ -54,7 +54,7 @@ def _invert_scaled(matrix: Floats, scale: Floats, inverse: Floats) -> None:
 def linearise_ranges(
     ranges: Any, place_ecef_m: Floats, axes: Floats, prior: Floats
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Linearise ranges at positions and whiten them, with the clocks eliminated.
+    """Linearise and whiten ranges at positions, with the clocks eliminated.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def linearise_ranges(
                     rows[m, i] = -(u0 * axes[t, i, 0] + u1 * axes[t, i, 1] + u2 * axes[t, i, 2])
                     sums[i, g] += w * rows[m, i]
             total += totals[g]
-        # Subtracting one constant from all ranges changes no residual, and preserves digits of the sums.
+        # A constant is subtracted from all ranges, which preserves digits of the sums and changes no residual.
         common = common / total if total > 0.0 else 0.0
         _write_clock_covariance(totals, sigma_m[t] if tied else no, rho, clocks[t])
         for i in range(3):

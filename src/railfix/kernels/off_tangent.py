@@ -1,4 +1,4 @@
-"""Risk that the true position is on a part of the line that deviates from the tangent at the estimated position."""
+"""Probability that the true position is on a part of the line away from the tangent at the estimated position."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from railfix.kernels.compiling import inner, kernel
 
 @inner
 def _inverse(matrix: Floats) -> Floats:
-    """Return the inverse of a symmetric 3 x 3 matrix; the elements are not finite if the matrix is singular."""
+    """Return the inverse of a symmetric 3 x 3 matrix, which is not finite if the matrix is singular."""
     inverse = np.empty((3, 3))
     for a in range(3):
         i, j = (a + 1) % 3, (a + 2) % 3
@@ -30,7 +30,7 @@ def _inverse(matrix: Floats) -> Floats:
 
 @inner
 def _tail(clear_m: float, spread: float, start: float, misfit: float, tau: float) -> float:
-    """Return an upper bound of the tail of a quadratic form that is at least ``1 - tau`` times that of all channels."""
+    """Return an upper bound of the tail for a matrix of at least ``1 - tau`` times the matrix of all channels."""
     if not tau < 1.0:
         return 1.0
     form = (start + math.sqrt(max(tau, 0.0)) * misfit) ** 2 / (1.0 - tau)
@@ -41,10 +41,10 @@ def _tail(clear_m: float, spread: float, start: float, misfit: float, tau: float
 
 @inner
 def _lowest(form: Floats) -> tuple[float, float, float, float, float, float, float]:
-    """Return the minimum point of a quadratic form, the diagonal cofactors of its matrix, and 1 over the determinant.
+    """Return the minimum point of a quadratic form, and diagonal cofactors and inverse determinant of its matrix.
 
-    A form is an array of `constant`, `slope` (3), and the matrix elements xx, xy, xz, yy, yz, zz. If the matrix is
-    singular, all returned numbers are 0.
+    A form is an array of a constant, three elements of the slope, and the matrix elements xx, xy, xz, yy, yz, zz. All
+    returned numbers are 0 if the matrix is singular.
     """
     sx, sy, sz = form[1], form[2], form[3]
     xx, xy, xz, yy, yz, zz = form[4], form[5], form[6], form[7], form[8], form[9]
@@ -63,7 +63,7 @@ def _lowest(form: Floats) -> tuple[float, float, float, float, float, float, flo
 
 @inner
 def _compute_tail(form: Floats, clear_m: float) -> float:
-    """Return the tail of a quadratic form, computed from the matrix and slope of this form."""
+    """Return the tail of a quadratic form."""
     x, y, z, c_xx, c_yy, _, inverse = _lowest(form)
     if inverse == 0.0:
         return 1.0
@@ -75,18 +75,18 @@ def _compute_tail(form: Floats, clear_m: float) -> float:
 
 
 class _Residuals(NamedTuple):
-    """Residuals of the used channels, projector of these channels, and change of the residuals with the position."""
+    """Projector of the used channels, their residuals, and the change of the residuals with the position (`rows`)."""
 
     projector: Floats  # (M, M)
     residual: Floats  # (M,)
     rows: Floats  # (3, M)
-    whitened: Floats  # (4, M): root of the weight and design, work space
+    whitened: Floats  # (4, M): root of the weight, and design; work space
     clock: Indices  # (M,), work space
 
 
 @inner
 def _work_space(channels: int) -> _Residuals:
-    """Allocate work arrays for a number of channels."""
+    """Allocate work arrays."""
     clock = np.empty(channels, dtype=np.intp)
     projector, whitened = np.empty((channels, channels)), np.empty((4, channels))
     return _Residuals(projector, np.empty(channels), np.empty((3, channels)), whitened, clock)
@@ -94,7 +94,7 @@ def _work_space(channels: int) -> _Residuals:
 
 @inner
 def _without(i: int, j: int, residuals: Any, every: Floats, form: Floats) -> None:
-    """Write the quadratic form without the channels i and j (-1 for none), computed from the form of all channels."""
+    """Write the quadratic form without channels i and j (-1 for none), from the form `every` of all channels."""
     projector, residual, rows, _, _ = residuals
     for k in range(10):
         form[k] = every[k]
@@ -141,7 +141,7 @@ def _without(i: int, j: int, residuals: Any, every: Floats, form: Floats) -> Non
 
 @inner
 def _without_side(side: Masks, used: Indices, residuals: Any, every: Floats, form: Floats) -> bool:
-    """Write the quadratic form without the channels of a side; return whether the side has at least two channels."""
+    """Write the quadratic form without the channels of a side; return True if the side has at least two channels."""
     projector, residual, rows, _, _ = residuals
     n, count = len(used), 0
     member, work = np.empty(n, dtype=np.intp), np.empty((n, n + 4))
@@ -182,9 +182,9 @@ def _without_side(side: Masks, used: Indices, residuals: Any, every: Floats, for
 def _whiten(
     model: Any, t: int, noise: float, sigma_m: tuple[float, float], used: Indices, residuals: Any, every: Floats
 ) -> int:
-    """Write the channels in use, their residuals, and the quadratic form of all of them; return their number.
+    """Write the used channels, their residuals, and their quadratic form; return the number of these channels.
 
-    The map error is taken as equal in all horizontal directions, because the tangent differs between positions.
+    The map error is assumed equal in all horizontal directions, because the tangent differs between positions.
     """
     root_weight, clock, clock_covariance_m2, design, covariance_m2, map_prior, misfit = model
     projector, residual, rows, whitened, group = residuals
@@ -198,7 +198,7 @@ def _whiten(
             asked[clock[m]] += roots[n] * misfit[t, m]
             x, y, z = x + misfit[t, m] * along[n], y + misfit[t, m] * across[n], z + misfit[t, m] * up[n]
             n += 1
-    # Map error, isotropic in the horizontal plane, and the position implied by the residuals.
+    # Information of the map, isotropic in the horizontal plane, and position implied by the residuals.
     normal = _inverse(covariance_m2[t])
     of_map[0] = of_map[1] = (noise / sigma_m[0]) ** 2
     of_map[2] = (noise / sigma_m[1]) ** 2
@@ -247,13 +247,13 @@ def risk_off_tangent(
     sigma_m: tuple[float, float],
     enough: float,
 ) -> Floats:
-    """Return an upper bound of the probability that the true position lies off the tangent beyond a distance.
+    """Return an upper bound of the probability that the true position is off the tangent, beyond a distance.
 
-    At a distance D along and across, a quadratic form exceeds its value at the position by at least ``(D - |c|)^2 /
-    trace(C) - c . s``. Here c is the minimum point, C the inverse of the matrix, both along and across, and s the
-    slope. Without the channels J, the matrix is at least ``1 - tau`` times that of all channels, with ``tau = trace(F_J
-    C F_J^T S_JJ^-1)`` and these channels' rows F_J of the design. The largest tau of one channel and of two decides
-    most epochs; in the other epochs, each subset is bounded separately.
+    At a horizontal distance D, a quadratic form exceeds its value at the position by at least ``(D - |c|)^2 / trace(C)
+    - c . s``. Here c is the minimum point and C the inverse of the matrix, both horizontal, and s is the slope. Without
+    the channels J, whose rows of the design are F_J, the matrix is at least ``1 - tau`` times the matrix of all
+    channels, with ``tau = trace(F_J C F_J^T S_JJ^-1)``. The largest tau of single channels and of pairs decides most
+    epochs. In other epochs, each subset is bounded separately.
 
     Parameters
     ----------
@@ -261,11 +261,11 @@ def risk_off_tangent(
         T epochs by M channels.
     scale : ndarray, shape (T,)
     likely : ndarray, shape (M,)
-        Prior probability of a fault of each channel.
+        Prior fault probability of each channel.
     sides : ndarray of bool, shape (T, S, M)
         Groups of channels that are assumed to be faulty together.
     side_prior : float
-        Prior probability of a fault of a whole side.
+        Prior fault probability of a whole side.
     clear_m : ndarray, shape (T,) [m]
         Distance within which no part of the line deviates from the tangent.
     sigma_m : tuple of float [m]
@@ -276,7 +276,7 @@ def risk_off_tangent(
     Returns
     -------
     ndarray, shape (T,)
-        Sum over the hypotheses: no fault, one or two faulty satellites, a faulty side.
+        Sum over the hypotheses of no fault, of one or two faulty satellites, and of a faulty side.
     """
     epochs, channels = model.root_weight.shape
     used, total, leverage = np.empty(channels, dtype=np.intp), np.empty(epochs), np.empty(channels)
@@ -291,7 +291,7 @@ def risk_off_tangent(
             for b in range(a, 3):
                 matrix[a, b] = matrix[b, a] = every[at]
                 at += 1
-        # Largest tau of one channel and of two channels.
+        # Largest tau of single channels and of pairs.
         of_all = _inverse(matrix)
         spread, start, one, two = of_all[0, 0] + of_all[1, 1], 0.0, 0.0, 0.0
         for a in range(3):
@@ -343,19 +343,18 @@ def risk_off_tangent(
 def forms_of_hypotheses(
     model: Any, scale: Floats, likely: Floats, sides: Masks, side_prior: float, sigma_m: tuple[float, float]
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Return the quadratic forms of K hypotheses: no fault, and a fault of each channel, each pair and each side.
+    """Return the quadratic forms of K hypotheses: no fault, a fault of each channel, of each pair and of each side.
 
     Parameters are those of `risk_off_tangent`.
 
     Returns
     -------
     prior : ndarray, shape (T, K)
-        0 for unused entries.
+        Probability of each hypothesis; 0 for unused entries.
     form : ndarray, shape (T, K, 10)
-        See `_lowest`.
+        Quadratic forms, as in `_lowest`.
     lowest_m, depth, widest_m2 : ndarray, shape (T, K)
-        Distance to the minimum of each form, depth of the minimum, and trace of the inverse matrix; NaN where the
-        matrix is singular.
+        Distance to the minimum (NaN for a singular matrix), depth of the minimum, and trace of the inverse matrix.
     """
     epochs, channels = model.root_weight.shape
     most = 0
@@ -371,7 +370,7 @@ def forms_of_hypotheses(
     residuals = _work_space(channels)
     for t in range(epochs):
         n = _whiten(model, t, scale[t], sigma_m, used, residuals, every)
-        prior[t, 0], at = 2.0, 1  # noise exceeds the level on either side
+        prior[t, 0], at = 2.0, 1  # two-sided: noise of either sign
         _without(-1, -1, residuals, every, form[t, 0])
         for i in range(n):
             for j in range(-1, i):
@@ -402,20 +401,20 @@ def risk_beyond(
     length_m: Floats,
     beyond_m: Floats,
 ) -> Floats:
-    """Return the probability that the true position is off the tangent and beyond a level, for K hypotheses, (T,).
+    """Return the probability that the true position is off the tangent and beyond a protection level, shape (T,).
 
     Parameters
     ----------
     prior, form : ndarray
-        Returned by `forms_of_hypotheses`: ``q(d) = constant - 2 d . slope + d^T matrix d`` at the displacement d.
+        Results of `forms_of_hypotheses`: ``q(d) = constant - 2 d . slope + d^T matrix d`` at the displacement d.
     radius_m : ndarray, shape (T, K)
-        Distance of the line beyond the level below which a hypothesis is included.
+        Largest distance of the line beyond the level at which each hypothesis is included.
     first : ndarray of int, shape (T + 1,)
-        First section of each epoch.
+        First section of each epoch, and P at the end.
     start_m, tangent : ndarray, shape (P, 3)
     length_m : ndarray, shape (P,)
     beyond_m : ndarray, shape (P,)
-        Distance of each section that is beyond the level; infinite for other sections.
+        Distance of each section beyond the level; infinite for other sections.
     """
     epochs, hypotheses = prior.shape
     spent = np.zeros(epochs)

@@ -1,4 +1,4 @@
-"""Pseudorange residuals at a position, with the clocks eliminated, and positions from pseudoranges."""
+"""Pseudorange residuals at a position with the clocks eliminated, and positions from pseudoranges."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class _Epoch(NamedTuple):
 
 
 class _Equations(NamedTuple):
-    """Results of `reduced_equations` for one epoch, and weights of the clock groups."""
+    """Results of `reduced_equations` for one epoch, and total weights of the clock groups."""
 
     system: Floats
     means: Floats
@@ -37,7 +37,7 @@ class _Equations(NamedTuple):
 def reduce_epoch(epoch: _Epoch, place_ecef_m: Floats, equations: _Equations) -> None:
     """Compute the normal equations of one epoch.
 
-    The loops over all channels have no branches, so that they are vectorised. Unused channels must have finite values.
+    The vectorised loops have no branches, so that unused channels must have finite values, too.
     """
     sat_ecef_m, code_m, weight, starts, offset_m, _ = epoch
     system, means, rows, totals, _ = equations
@@ -127,13 +127,13 @@ def reduced_equations(ranges: Any, place_ecef_m: Floats) -> tuple[Floats, Floats
     Returns
     -------
     system : ndarray, shape (T, 4, 4)
-        Normal matrix of four columns: the three axes and the residual.
+        Normal matrix of the three axes and the residual.
     means : ndarray, shape (T, 4, G)
-        Weighted means of the clock groups.
+        Weighted means of design and residual in each clock group.
     rows : ndarray, shape (T, 4, M)
         Design and residual minus the means of the clock group; 0 where the weight is 0.
     seen : ndarray of bool, shape (T, G)
-        Clock groups that have a weight above 0.
+        True for clock groups with a weight above 0.
     """
     sat_ecef_m, code_m, weight, starts, offset_m, sigma_m = ranges
     epochs, channels = weight.shape
@@ -153,7 +153,7 @@ def reduced_equations(ranges: Any, place_ecef_m: Floats) -> tuple[Floats, Floats
 
 @kernel
 def misfits(ranges: Any, place_ecef_m: Floats, epochs: Indices) -> Floats:
-    """Compute `normal_equations.misfit` for arrays in C order, at one position for each of `epochs`."""
+    """Compute `normal_equations.misfit` at one position per epoch in `epochs`, for arrays in C order."""
     sat_ecef_m, code_m, weight, starts, offset_m, sigma_m = ranges
     channels, groups = weight.shape[1], len(starts)
     tied = len(offset_m) == len(code_m)
@@ -197,7 +197,7 @@ def misfits(ranges: Any, place_ecef_m: Floats, epochs: Indices) -> Floats:
 def _settle(step: Floats, means: Floats, rows: Floats, totals: Floats, clock_m: Floats, residual_m: Floats) -> None:
     """Compute the clocks and residuals of one epoch after a step of the position, to first order.
 
-    After a step of 5 m the error is 0.03 mm, as the design neglects the gradient of the Earth's rotation correction.
+    After a step of 5 m, the neglected gradient of the Earth's rotation correction causes an error of 0.03 mm.
     """
     for g in range(len(totals)):
         moved = means[3, g] - (step[0] * means[0, g] + step[1] * means[1, g] + step[2] * means[2, g])
@@ -225,7 +225,7 @@ def invert(matrix: Floats, inverse: Floats) -> None:
 def iterate_points(
     ranges: Any, start_ecef_m: Floats, enough: Masks, tolerance_m: float, most: int
 ) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
-    """Compute 3-D positions by Newton steps of least squares.
+    """Compute 3-D least-squares positions by Newton steps.
 
     Parameters
     ----------
@@ -286,7 +286,7 @@ def iterate_points(
 
 @kernel
 def dilutions(ranges: Any, place_ecef_m: Floats) -> Floats:
-    """Return the position dilution of precision at positions (T, 3), shape (T,); NaN where the geometry is singular."""
+    """Return the dilutions of precision, shape (T,), at positions, shape (T, 3); NaN where the geometry is singular."""
     sat_ecef_m, code_m, weight, starts, offset_m, sigma_m = ranges
     epochs, channels = weight.shape
     groups, no, tied = len(starts), np.empty(0), len(offset_m) == epochs
@@ -306,7 +306,7 @@ def dilutions(ranges: Any, place_ecef_m: Floats) -> Floats:
 
 @inner
 def _form(system: Floats, a: Floats, b: Floats) -> float:
-    """Return the normal matrix multiplied by two directions, ``a' system b``."""
+    """Return the bilinear form ``a' system b`` of the normal matrix."""
     form = 0.0
     for i in range(3):
         form += a[i] * (system[i, 0] * b[0] + system[i, 1] * b[1] + system[i, 2] * b[2])
@@ -317,9 +317,9 @@ def _form(system: Floats, a: Floats, b: Floats) -> float:
 def _along(
     system: Floats, tangent: Floats, across: Floats, up: Floats, plan: float, height: float
 ) -> tuple[float, float, float, float]:
-    """Return step, sigma, sigma with an exact map, and minimum WSSE along a section; the others include the map error.
+    """Return step, sigma, sigma without map error, and minimum WSSE along a section.
 
-    The Schur complement eliminates the map error, so that only the distance along the line remains.
+    The map error across the section is eliminated with the Schur complement.
     """
     own, a, c = _form(system, tangent, tangent), _form(system, across, across), _form(system, up, up)
     to_plan, to_height, b = _form(system, tangent, across), _form(system, tangent, up), _form(system, across, up)
@@ -347,14 +347,14 @@ def _along(
 def iterate_along(
     ranges: Any, line: Any, vertex: Indices, tolerance_m: float, most: int
 ) -> tuple[Indices, Floats, Floats, Floats, Integers]:
-    """Compute positions along the line by Newton steps of constrained least squares.
+    """Compute constrained least-squares positions along the line by Newton steps.
 
     Parameters
     ----------
     ranges : RangeArrays
     line : SectionArrays
     vertex : ndarray of int, shape (T,)
-        Start point; -1 for none.
+        Start point on the line; -1 for none.
     tolerance_m, most
         Step [m] below which the iteration has converged, and largest number of steps.
 
@@ -362,8 +362,7 @@ def iterate_along(
     -------
     section : ndarray of int, shape (T,)
     solved : ndarray, shape (6, T)
-        Distance along the section [m]; `sigma_m`, `exact_map_sigma_m`, `wsse`, `overshoot_m` and `dilution` of
-        `Constrained`.
+        Distance along the section [m], and fields `sigma_m`, `exact_map_sigma_m`, `wsse`, `overshoot_m`, `dilution`.
     clock_m, residual_m, iterations
         Fields of `Constrained`.
     """

@@ -1,4 +1,4 @@
-"""Decode the lines and observation fields of a text, and compute the array indices of the fields."""
+"""Decoding of the observation fields of RINEX lines, and writing of fields into arrays."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ _LOW_PAIR, _HIGH_PAIR = _U(100 + (1_000_000 << 32)), _U(1 + (10_000 << 32))
 
 @inner
 def _eight_digits(word: np.uint64) -> np.uint64:
-    """Return the value of eight decimal digits; the lowest byte is the most significant digit."""
+    """Return the value of eight decimal digits, with the most significant digit in the lowest byte."""
     word = word * _10 + (word >> _8)
     return ((word & _PAIRS) * _LOW_PAIR + ((word >> _16) & _PAIRS) * _HIGH_PAIR) >> _32
 
 
 @inner
 def _word(data: Bytes, at: np.uintp) -> np.uint64:
-    """Return eight characters as an integer, the first in the lowest byte; this is compiled to one load instruction."""
+    """Return eight characters as an integer, the first in the lowest byte, by a single load instruction."""
     word = _U(data[at])
     for i in range(1, 8):
         word |= _U(data[at + np.uintp(i)]) << _U(8 * i)
@@ -42,10 +42,10 @@ def _word(data: Bytes, at: np.uintp) -> np.uint64:
 def decode_fields(
     data: Bytes, start: Integers, length: Integers, index: Indices, divisor: Floats
 ) -> tuple[Floats, Bytes, Masks]:
-    """Decode the fields that have the standard form, shape (n, k); the arguments are those of `read_fields`.
+    """Decode the fields of n lines that have the standard form; the arguments are those of `read_fields`.
 
-    Returns the values (NaN where blank or not of standard form), the loss-of-lock digits (uint8, 255 where the last two
-    characters are neither blanks nor digits), and a mask of the fields that do not have the standard form.
+    All results have shape (n, k). Return the values, which are NaN for blank fields and fields of another form. Also
+    return the loss-of-lock digits (255 if the last two characters are wrong), and True for fields of another form.
     """
     rows, columns = len(start), len(index)
     value, lock = np.empty((rows, columns)), np.zeros((rows, columns), dtype=np.uint8)
@@ -96,18 +96,18 @@ def decode_fields(
 def place_fields(
     kinds: Floats, lock: Bytes, cell: Integers, kind: Indices, signal: Indices, value: Floats, digit: Bytes
 ) -> tuple[Floats, Bytes]:
-    """Write fields into the dense arrays in place and return these arrays; fields with the value 0 are absent.
+    """Write fields into dense arrays in place, and return these arrays. Fields with the value 0 are not written.
 
     Parameters
     ----------
     kinds, lock : ndarray, shape (4, T, M), and of uint8, (T, M)
-        One array per kind of observable.
+        Values per kind of observable, and loss-of-lock digits.
     cell : ndarray of int, shape (n,)
-        For each line, the epoch's index times M, plus the satellite's first channel.
+        Index of the epoch times M plus the satellite's first channel, for each line.
     kind, signal : ndarray of int, shape (k,)
-        Kind of observable of each field, and its channel index within the satellite.
+        Kind of observable of each field, and index of its channel within the satellite.
     value, digit : ndarray, shape (n, k)
-        Values, and loss-of-lock digits.
+        Results of `decode_fields`.
     """
     flat, flat_lock = kinds.reshape(len(kinds), -1), lock.reshape(-1)
     for r in range(len(cell)):
@@ -122,7 +122,7 @@ def place_fields(
 
 @kernel
 def line_ends(data: Bytes) -> Integers:
-    """Return the offsets of the line feeds in a text."""
+    """Return the positions of the line feeds in a text."""
     ends, found = np.empty(1024, dtype=np.int64), 0
     for at in range(0, len(data), 8):
         if at + 8 <= len(data):

@@ -1,4 +1,4 @@
-"""Robust weights of ranges (IGG-III)."""
+"""Robust weights of ranges by the IGG-III scheme."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ from railfix.core.arrays import Floats, Indices, Masks
 from railfix.kernels.compiling import inner, kernel
 from railfix.kernels.sight import sight
 
-#: Smallest scale of whitened residuals; ranges agree more closely only by chance.
+#: Smallest scale of whitened residuals; a smaller scale is a coincidence.
 _LEAST_SCALE = 0.05
 
 
 class _Room(NamedTuple):
-    """Work space of one epoch: the used channels are contiguous, and those of clock g begin at ``begin[g]``.
+    """Work space of one epoch: the used channels are contiguous, and the channels of clock g begin at ``begin[g]``.
 
-    For each channel (M,): its `channel` in the ranges, `base` weight and its `root`, unit vector to the satellite
-    `sight` (3, M), `misfit`, robust `factor` of the weight, `white` residual, `order` by it, weight in the `row`s,
-    which are sights and misfits less the clock's mean (4, M). For each clock (G,): the `total` weight and the `mean`
-    row (4, G); for the known clock offsets, the weight `mass` and the difference from the other clocks, `apart` (4, G).
+    Fields of shape (M,) are the index `channel` in the ranges, the `base` weight and its `root`, the `misfit`, the
+    robust `factor`, the `weight`, the whitened residual `white`, and the `order` of these residuals. `sight`, shape (3,
+    M), are unit vectors to the satellites. `row`, shape (4, M), are sights and misfits minus the mean of the clock.
+    `total`, shape (G,), and `mean`, shape (4, G), are weights and mean rows of the clocks. `mass`, shape (G,), and
+    `apart`, shape (4, G), are weights and differences of clocks with known offsets.
     """
 
     begin: Indices
@@ -60,7 +61,7 @@ def reweight_ranges(
         Linearisation points, in C order.
     information : ndarray, shape (T, 3, 3) [1/m^2], or (0, 3, 3)
     correction : ndarray, shape (T,)
-        Ratio of the scale of the residuals to the median of the residuals.
+        Ratio of scale to median of the residuals.
     keep, reject : float
     iterations : int
 
@@ -68,7 +69,7 @@ def reweight_ranges(
     -------
     kept : ndarray of bool, shape (T, M)
     wsse : ndarray, shape (T,)
-        Weighted sum of squared residuals of the kept ranges.
+        Weighted sum of the squared residuals of kept ranges.
     solved : ndarray of bool, shape (T,)
         False where the equations of the last step were singular.
     """
@@ -102,7 +103,7 @@ def reweight_ranges(
 
 @inner
 def _new_room(channels: int, clocks: int) -> _Room:
-    """Allocate the work space."""
+    """Allocate the work space of an epoch."""
     numbers, of_channel = np.zeros((2, channels), dtype=np.int64), np.empty((6, channels))
     return _Room(
         np.zeros(clocks + 1, dtype=np.int64), numbers[0], numbers[1], of_channel[0], of_channel[1], of_channel[2],
@@ -113,7 +114,7 @@ def _new_room(channels: int, clocks: int) -> _Room:
 
 @inner
 def _choose_channels(ranges: Any, t: int, place: Floats, room: _Room) -> int:
-    """Write the used channels contiguously, with unit vectors to the satellites and misfits; return their number."""
+    """Write the used channels contiguously, with sights and misfits; return the number of these channels."""
     channels, clocks, count = ranges.weight.shape[1], len(ranges.starts), 0
     for g in range(clocks):
         room.begin[g], stop = count, ranges.starts[g + 1] if g + 1 < clocks else channels
@@ -134,7 +135,7 @@ def _choose_channels(ranges: Any, t: int, place: Floats, room: _Room) -> int:
 
 @inner
 def _sum_clocks(room: _Room) -> None:
-    """Write the weights, and the total weight and mean row of each clock; subtract the mean from the rows."""
+    """Write the weights, and each clock's total weight and mean row, and subtract the mean row from the rows."""
     for g in range(len(room.total)):
         total = x = y = z = misfit = 0.0
         for k in range(room.begin[g], room.begin[g + 1]):
@@ -197,7 +198,7 @@ def _add_ties(offset_m: Floats, sigma_m: Floats, room: _Room, normal: Floats, ve
 
 @inner
 def _solve(normal: Floats, vector: Floats, step: Floats) -> bool:
-    """Solve three symmetric equations, and return whether they are regular; if they are not, the step is zero."""
+    """Solve three symmetric equations, and return True if they are regular; otherwise, the step is zero."""
     a, b, c, d, e, f = normal[0, 0], normal[0, 1], normal[0, 2], normal[1, 1], normal[1, 2], normal[2, 2]
     of_x, of_y, of_z = d * f - e * e, c * e - b * f, b * e - c * d
     determinant, mean = a * of_x + b * of_y + c * of_z, (a + d + f) / 3.0
@@ -213,7 +214,7 @@ def _solve(normal: Floats, vector: Floats, step: Floats) -> bool:
 
 @inner
 def _write_residuals(step: Floats, solved: bool, room: _Room) -> None:
-    """Write the whitened residuals after the step of position and clocks; they are zero if there is no step."""
+    """Write the absolute whitened residuals after the step; they are zero if `solved` is False."""
     for g in range(len(room.total)):
         known = 1.0 if solved and room.total[g] > 0.0 else 0.0
         clock = room.mean[3, g]
@@ -225,7 +226,7 @@ def _write_residuals(step: Floats, solved: bool, room: _Room) -> None:
 
 @inner
 def _median(count: int, room: _Room) -> float:
-    """Return the median of the whitened residuals; `room.order` keeps the order, which changes little between calls."""
+    """Return the median of the whitened residuals; `room.order` is kept, because it changes little between calls."""
     for k in range(count):
         at, number = k, room.order[k]
         while at > 0 and room.white[room.order[at - 1]] > room.white[number]:
@@ -237,7 +238,7 @@ def _median(count: int, room: _Room) -> float:
 
 @inner
 def _reweight(count: int, scale: float, keep: float, reject: float, room: _Room) -> bool:
-    """Write the robust factors from the scaled residuals; return whether any factor has changed."""
+    """Write the robust factors from the scaled residuals; return True if a factor has changed."""
     changed = False
     for k in range(count):
         size, before = room.white[k] / scale, room.factor[k]

@@ -1,4 +1,4 @@
-"""Kernels of screens: code offsets after jumps, medians over the channels of a clock, and signs of interference."""
+"""Kernels of the screens: code offsets after jumps, medians per receiver clock, and signs of interference."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.kernels.compiling import inner, kernel
 
-#: Time of an event that has not occurred (NaT as an integer).
+#: Integer of NaT, the time of an event that has not occurred.
 NEVER = np.iinfo(np.int64).min
 _NS = 1_000_000_000
 
@@ -36,12 +36,12 @@ def middle(ordered: Floats, size: int) -> float:
 def suspicions(
     time_ns: Integers, metric: Floats, limit: Floats, level_before: Floats, since_before: Integers, hold_ns: int
 ) -> tuple[Masks, Floats, Integers]:
-    """Track the offset of each satellite's code after a jump.
+    """Track the offset of each channel's code after a jump.
 
     An offset is the sum of the metric since the jump, so that chunk boundaries have no effect. `metric` and `limit`
-    have shape (T, M), in C order. The offsets and the starts of suspicions before the chunk have shape (M,); the start
-    is `NEVER` without a suspicion. Return the rejections, the offsets (0 without a suspicion, NaN without a metric),
-    and the starts of the suspicions that continue after the chunk.
+    have shape (T, M), in C order. `level_before` and `since_before`, shape (M,), are offsets and starts of suspicions
+    before the chunk; the start is `NEVER` without a suspicion. Return True for rejected codes, and the offsets, which
+    are 0 without a suspicion and NaN without a metric. Also return the starts of suspicions that continue.
     """
     epochs, channels = metric.shape
     reject, level = np.zeros((epochs, channels), dtype=np.bool_), np.empty((epochs, channels))
@@ -55,7 +55,7 @@ def suspicions(
             suspected = suspected and not math.isnan(value) and time_ns[t] <= start + hold_ns
             if suspected:
                 total += value
-                suspected = abs(total) > limit[t, m]  # the epoch at which the code returns is not tested for a new jump
+                suspected = abs(total) > limit[t, m]  # an epoch at which a suspicion ends is not tested for a new jump
             elif abs(value) > limit[t, m]:
                 start, total, suspected = time_ns[t], value, True
             if suspected:
@@ -67,10 +67,10 @@ def suspicions(
 
 @kernel
 def clock_medians(values: Floats, clock: Indices, satellite: Indices, least: int) -> Floats:
-    """Return for each channel the median of the values (T, M) of all channels of the same clock; NaN is ignored.
+    """Return the median of the values of all channels with the same clock for each channel, shape (T, M).
 
-    It is NaN with fewer than `least` finite satellites. `clock` and `satellite` are the indices of each channel, shape
-    (M,).
+    NaN values are ignored. A median is NaN with finite values of fewer than `least` satellites. `clock` and `satellite`
+    are the indices of each channel's clock and satellite, shape (M,).
     """
     epochs, channels = values.shape
     result = np.full(values.shape, math.nan)
@@ -99,7 +99,7 @@ def clock_medians(values: Floats, clock: Indices, satellite: Indices, least: int
 
 @inner
 def _deviation(values: Floats, count: int) -> float:
-    """Return the standard deviation of values."""
+    """Return the standard deviation of the first `count` values."""
     total = square = 0.0
     for k in range(count):
         total += values[k]
@@ -118,11 +118,9 @@ def falls_of_cn0(
     known_after_s: float,
     least: int,
 ) -> tuple[Floats, Floats, Floats, tuple[Floats, Floats, Floats]]:
-    """Return the falls of C/N0 below recent peaks: the statistics of `PowerSigns`, shape (T,), and the state
-    afterwards.
+    """Return the statistics of `PowerSigns` on falls of C/N0 below recent peaks, shape (T,), and the next `before`.
 
-    `before` has the peaks, start times and last observation times of `PowerState`, shape (K,). A peak decays by `decay`
-    per second.
+    `before` are peaks, start times and last observation times of `PowerState`, shape (K,). `decay` is in dB/s.
     """
     epochs, channels = cn0_dbhz.shape
     peak, first, last = before[0].copy(), before[1].copy(), before[2].copy()
@@ -161,10 +159,10 @@ def clock_steps(
     longest_s: float,
     least: int,
 ) -> tuple[Floats, tuple[Floats, Floats, Integers]]:
-    """Return the median over channels of code change minus Doppler change, shape (T,), and the state afterwards.
+    """Return the median over channels of code change minus Doppler change, shape (T,), and the next `before`.
 
-    `before` and the returned state have each channel's last code, Doppler and time, shape (K,). Values are not compared
-    across a break or after more than `longest_s`. The median is NaN with fewer than `least` channels.
+    `before` has the last code, Doppler and time of each channel, shape (K,). Values are not compared across a break or
+    after more than `longest_s`. The median is NaN with fewer than `least` channels.
     """
     epochs, channels = code_m.shape
     code, rate, since = before[0].copy(), before[1].copy(), before[2].copy()
@@ -198,10 +196,10 @@ def holds(
     hold_ns: Integers,
     release_s: Floats,
 ) -> tuple[Masks, Masks, tuple[Integers, Integers]]:
-    """Return masks (T, C): conditions that have been true for the required time, and conditions that are still active.
+    """Return two masks, shape (T, C): conditions that have been true for the required time, and active conditions.
 
-    The state after the chunk is also returned (see `integrity.interference.limits.hold_signs`). `before` has the
-    duration of each condition and the time at which the condition was last active, shape (C,).
+    A condition remains active for `release_s` (`integrity.interference.limits.hold_signs`). `before` has the duration
+    of each condition and the last time at which it counted as true, shape (C,). Also return the next `before`.
     """
     epochs, conditions = signs.shape
     run, last, previous = before[0].copy(), before[1].copy(), time_before

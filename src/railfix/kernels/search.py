@@ -1,4 +1,4 @@
-"""Search for line points near a position, and for the best of them; distances within which a line is straight."""
+"""Search for line points near a position and for the best of them, and distances within which a line is straight."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.core.constants import ALONG, CLEAR_M, FAN_OUT, ON_TANGENT_M, ROTATION_GRADIENT
 from railfix.kernels.compiling import inner, kernel
 
-#: Half the inverse of the shortest range to a navigation satellite (GLONASS at the zenith), rounded down [1/m].
+#: Half the inverse of the shortest satellite range [m], of GLONASS at the zenith, rounded down [1/m].
 _CURVATURE = 1.0 / (2.0 * 1.9e7)
-#: Allowance for rounding errors in the radius of a stretch [m].
+#: Allowance for rounding errors in the radius of a stretch of line [m].
 _SLACK_M = 1e-6
 
 
 @inner
 def _bend_m(distance_m: float) -> float:
-    """Return the largest linearisation error of a range [m] at a distance from the linearisation point."""
+    """Return the largest linearisation error of a range [m] at a distance from the linearisation point [m]."""
     return distance_m * distance_m * _CURVATURE + ROTATION_GRADIENT * distance_m
 
 
@@ -34,9 +34,9 @@ def radii_of_balls(
     freedom: Integers,
     limit: float,
 ) -> Floats:
-    """Return the radius of the ball around each 3-D position that contains every candidate point, shape (n,) [m].
+    """Return the radii [m] of balls around 3-D positions that contain all candidate points of the line, shape (n,).
 
-    The radius is NaN where linearisation errors make it indeterminate.
+    A radius is NaN where linearisation errors are too large.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def radii_of_balls(
     weight_norm : ndarray, shape (n,)
         Root of the summed weights.
     freedom : ndarray of int, shape (n,)
-        Redundancy on the line, at least 1.
+        Redundancy of a position on the line, at least 1.
     limit : float
         `SectionLimits.reach`.
     """
@@ -77,9 +77,9 @@ def points_within(
     nodes: Indices,
     below: Indices,
 ) -> tuple[Indices, Indices, int]:
-    """Find the points of a line that are within a ball, with `SearchIndex.stretches`.
+    """Find the points of a line within a ball, with `SearchIndex.stretches`.
 
-    Return the work array that has the points, the other work array, and the number of points.
+    Return the work array with the indices of the points, the other work array, and the number of points.
     """
     middle, reach_m, first = stretches
     x, y, z = centre_m
@@ -116,7 +116,7 @@ def points_in_balls(
     least: Floats,
     weight_norm: Floats,
 ) -> tuple[Indices, Indices, Floats, Floats, Masks]:
-    """Find the points of a line in one ball per epoch, and q at each point by a quadratic form about the ball's centre.
+    """Find the points of a line in one ball per epoch, and compute the WSSE q at each point by a quadratic form.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ def points_in_balls(
         `SearchIndex.stretches`.
     centre_m, radius_m : ndarray, shapes (n, 3), (n,) [m]
     matrix, least : ndarray, shapes (n, 3, 3), (n,)
-        Coefficients of the quadratic form: normal matrix, and q at the centre.
+        Coefficients of the quadratic form about the centre: normal matrix, and q at the centre.
     weight_norm : ndarray, shape (n,)
         Root of the summed weights.
 
@@ -133,10 +133,10 @@ def points_in_balls(
     -------
     count : ndarray of int, shape (n,)
     vertex : ndarray of int, shape (p,)
-        Sorted by epoch and point.
+        Indices of the points, sorted by epoch and point.
     q, half_gradient : ndarray, shapes (p,), (p, 3)
     unsure : ndarray of bool, shape (p,)
-        True for a candidate that may be the best of its epoch within the error of the quadratic form.
+        True for points that may be the best of their epoch within the error of the quadratic form.
     """
     epochs = len(radius_m)
     count, found = np.zeros(epochs, dtype=np.intp), 0
@@ -176,7 +176,7 @@ def points_in_balls(
 
 @inner
 def _floor(vertex: int, q: float, slope: Floats, matrix: Floats, tangent: Floats, length_m: Floats) -> float:
-    """Return the minimum of q on the two sections that meet at a point, computed with the quadratic form."""
+    """Return the minimum of q by the quadratic form on the two sections that meet at a point."""
     floor = q
     for side in range(2):
         section, sign = vertex - side, 1.0 - 2.0 * side
@@ -200,7 +200,7 @@ def best_points(
     separation_m: float,
     turn_m: float,
 ) -> tuple[Indices, Floats, Floats, Indices]:
-    """Select for each epoch the best point, and the best point that counts as another position.
+    """Select each epoch's best point, and its best point that counts as another position.
 
     Parameters
     ----------
@@ -209,7 +209,7 @@ def best_points(
     line : tuple of ndarray
         `arc_m`, `tangent` and `length_m` of the trajectory.
     separation_m : float
-        Points closer together than this along the line count as one position.
+        Largest distance along the line of points that count as one position.
     turn_m : float
         Length of a closed line; infinite for an open line.
 
@@ -258,9 +258,10 @@ def clear_of_sections(
     stretches: tuple[Indices, Floats, Indices],
     section: Indices,
 ) -> Floats:
-    """Return for each section a distance, along and across, within which the line is on the tangent; shape (S,) [m].
+    """Return the horizontal distance [m] from each of S sections within which the line follows the section's tangent.
 
-    `ecef_m` has the points of the line (P, 3), the other arrays its sections; `stretches` is a field of `SearchIndex`.
+    `ecef_m`, shape (P, 3), has the points of the line, `tangent`, `across` and `length_m` have its sections. `section`
+    are the indices of the S sections. `stretches` is a field of `SearchIndex`.
     """
     clear, sections, longest = np.full(len(section), CLEAR_M), len(length_m), length_m.max()
     nodes, below = np.empty(len(ecef_m) + FAN_OUT, dtype=np.intp), np.empty(len(ecef_m) + FAN_OUT, dtype=np.intp)

@@ -1,4 +1,4 @@
-"""Exponentially weighted sums over earlier epochs, for several antennas whose epochs are stored one after another."""
+"""Exponentially weighted sums over earlier epochs of several antennas, whose epochs are stored one after another."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from railfix.core.arrays import Floats, Indices, Integers
 from railfix.kernels.compiling import kernel
 
-#: Length of a span, in windows; exp(50) = 5e21 neither overflows nor loses digits of the terms.
+#: Length of a span, in windows; with exp(50) = 5e21, the terms neither overflow nor lose digits.
 SPAN: Final = 50.0
 _NAT: Final = np.iinfo(np.int64).min
 _NS: Final = 1_000_000_000
@@ -20,10 +20,11 @@ _NS: Final = 1_000_000_000
 def window_ages(
     time_ns: Integers, last_ns: Integers, last_age: Floats, ends: Indices, window_s: float, least_epochs: float
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return ages of T epochs of A antennas; each antenna's rows end at `ends`, the epoch before is `last_ns` or NaT.
+    """Return the ages of T epochs of A antennas, in windows of `window_s`.
 
-    Three arrays have shape (T,): time since the previous epoch [s], age within the current span of `SPAN` windows, and
-    number of spans begun since the previous epoch. The fourth has the ages after the last epochs, shape (A,) [windows].
+    The rows of an antenna end before its entry in `ends`. `last_ns`, shape (A,), is the time of each antenna's previous
+    epoch, or NaT. Return three arrays of shape (T,): time since the previous epoch [s], age within the current span of
+    `SPAN` windows, and number of spans begun since the previous epoch. Also return the last ages, shape (A,).
     """
     epochs = len(time_ns)
     step, in_span, begun, end_age = np.zeros(epochs), np.empty(epochs), np.empty(epochs), last_age.copy()
@@ -44,12 +45,10 @@ def window_ages(
 
 @kernel
 def decayed_sums(values: Floats, growth: Floats, decay: Floats, current: Floats, ends: Indices) -> Floats:
-    """Return for each epoch the sum of the values (T, K) of all earlier epochs, weighted by ``exp(-difference of
-    ages)``.
+    """Return for each epoch the sum of the values of earlier epochs with the weights ``exp(-difference of ages)``.
 
-    `values` are already multiplied by `growth`. The running sums `current`, shape (A, K), are multiplied by the growth
-    since the start of a span, so that the order of additions does not depend on where a chunk begins; the new sums
-    replace them.
+    `values`, shape (T, K), are already multiplied by `growth`. The running sums `current`, shape (A, K), are updated in
+    place. They are multiplied by the growth since the start of a span, so that chunks have no effect on results.
     """
     before, first = np.empty(values.shape), 0
     for a in range(len(ends)):

@@ -1,8 +1,8 @@
 """Adaptation to the measurements: phase and Doppler noise, contradictions, length errors of the map, faulty satellites.
 
-The normalised innovations of a satellite's codes have a mean near 0 over a minute, even if there are reflections for a
-short time. A wrong clock record or a persistent reflection causes innovations of constant sign. The mean of the
-innovations, each clipped to one standard deviation, then shows the fault (`is_faulty`).
+Over a minute, the normalised innovations of a satellite's codes have a mean near 0, even with short reflections. A
+wrong clock record or a persistent reflection causes innovations of constant sign. The fault is detected by the mean of
+the innovations, each clipped to one standard deviation (`is_faulty`).
 """
 
 from __future__ import annotations
@@ -21,9 +21,7 @@ from railfix.kernels.tracking.update import Equations, Fit, mean_weights
 
 @inner
 def mean_square(rows: Rows, own: slice, found: Fit) -> float:
-    """Return the weighted mean square of normalised residuals of one measurement kind; NaN for three or fewer
-    residuals.
-    """
+    """Return the weighted mean square of the normalised residuals of the rows `own`; NaN for less than four."""
     size, total = own.stop - own.start, 0.0
     for j in range(own.start, own.stop):
         total += found.weight[j] * (found.residual[j] ** 2 + found.fitted[j]) / rows.variance[j]
@@ -32,7 +30,7 @@ def mean_square(rows: Rows, own: slice, found: Fit) -> float:
 
 @inner
 def update_scale(log_scale: float, mean_square: float, dt: float) -> float:
-    """Return the log scale of a variance, updated with an epoch's mean square; NaN leaves the log scale unchanged."""
+    """Return the log scale of a variance, updated with an epoch's mean square, which is ignored if it is NaN."""
     if not math.isnan(mean_square):
         log_scale += (1.0 - math.exp(-min(dt, 1.0) / constants.SCALE_S)) * math.log(mean_square)
     return min(max(log_scale, constants.LEAST_SCALE), constants.LARGEST_SCALE)
@@ -40,7 +38,7 @@ def update_scale(log_scale: float, mean_square: float, dt: float) -> float:
 
 @inner
 def update_doubt(monitors: Record, rows: Rows, found: Fit, dt: float) -> None:
-    """Update the timers of low motion weights and low code weights, and the filtered misfit of Dopplers and phases."""
+    """Update the timers of low motion and code weights, and the low-pass filtered misfit of Dopplers and phases."""
     code, motion = mean_weights(rows, rows.variance, found.weight)
     if motion < constants.LOST_MOTION_WEIGHT:
         monitors.weak_motion_s += dt
@@ -59,7 +57,7 @@ def update_doubt(monitors: Record, rows: Rows, found: Fit, dt: float) -> None:
 
 @inner
 def adapt(given: Given, t: int, state: State, rows: Rows, found: Fit, innovation: Floats, shift: float) -> bool:
-    """Adapt the state to an epoch's fit; return whether a further satellite's codes are left out from this epoch on.
+    """Adapt the state to an epoch's fit; return True if another satellite's codes are excluded from the next epoch on.
 
     `shift` is the result of `compute_code_shift` for the reported hypothesis.
     """
@@ -93,18 +91,18 @@ def update_bias(code_bias: float, innovation: float, code_s: float) -> float:
 
 @inner
 def is_faulty(code_bias: float) -> bool:
-    """Return whether a mean innovation is so large that the satellite's codes are left out."""
+    """Return True for a mean innovation that is so large that the satellite's codes are excluded."""
     return bool(code_bias > constants.BIAS_FAULTY or code_bias < constants.BIAS_SHORT)
 
 
 @inner
 def compute_code_shift(rows: Rows, equations: Equations, covariance: Floats, weight: Floats) -> float:
-    """Return the normalised position shift that the codes of an epoch imply; 0 with too few codes.
+    """Return the normalised position shift that the codes of an epoch imply; 0 with fewer than `MISFIT_CODES` codes.
 
     The shift is the score of the innovations v, ``h' S^-1 v / sqrt(h' S^-1 h)``, where h are the coefficients of the
     arc length. It is standard normal and white over epochs if the model is correct. `covariance`, shape (Q, Q), is H P
-    H' of the quantities before the measurements, codes first. `weight`, shape (M,), are the initial weights, limited to
-    1.
+    H' of the quantities before the measurements, codes first. `weight`, shape (M,), has the initial weights; larger
+    weights than 1 count as 1.
     """
     codes = rows.code.stop
     if codes < constants.MISFIT_CODES:
@@ -113,7 +111,7 @@ def compute_code_shift(rows: Rows, equations: Equations, covariance: Floats, wei
     for j in range(codes):
         S[j, j] += rows.variance[j] / min(weight[j], 1.0)
     score = information = 0.0
-    for i in range(codes):  # elimination: S = L D L', and the products of L^-1 h and L^-1 v over D
+    for i in range(codes):  # elimination with S = L D L': sums of the products of L^-1 h and L^-1 v, divided by D
         score += h[i] * v[i] / S[i, i]
         information += h[i] ** 2 / S[i, i]
         for j in range(i + 1, codes):
@@ -126,7 +124,7 @@ def compute_code_shift(rows: Rows, equations: Equations, covariance: Floats, wei
 
 @inner
 def update_map_scale(monitors: Record, shift: float, dt: float, parameters: Record) -> None:
-    """Update the mean code shift with an epoch's shift, and raise or lower the length error of the map."""
+    """Update the mean code shift with an epoch's shift, and adapt the assumed length error of the map."""
     dt = min(dt, 1.0)
     share = 1.0 - math.exp(-dt / constants.MAP_MISFIT_S)
     if abs(shift) > constants.STEP_SIGMAS:

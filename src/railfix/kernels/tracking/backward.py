@@ -1,4 +1,4 @@
-"""Propagation of information from later epochs backward through an epoch, for the smoother."""
+"""Backward propagation of information from later epochs through one epoch, for the smoother."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from railfix.kernels.tracking.update import correct
 def before_measurements(
     P: Floats, row: Floats, value: Floats, variance: Floats, vector: Floats, matrix: Floats
 ) -> tuple[Floats, Floats]:
-    """Propagate the information that later epochs give on the unknowns backward through an epoch's measurements.
+    """Propagate the information from later epochs backward through an epoch's measurements.
 
     docs/filter-equations.md has the formula of one measurement (G. J. Bierman, 1973).
 
-    The measurements, shapes (M, N), (M,), (M,), are in the order of the filter, and are processed backward from the
-    last. P, shape (N, N), is the covariance before the measurements. `vector` and `matrix`, shapes (N,) and (N, N), are
-    l and L after the measurements.
+    The measurements `row`, `value` and `variance`, shapes (M, N), (M,) and (M,), are in the order of the filter. They
+    are processed backward. P, shape (N, N), is the covariance before the measurements. `vector`, shape (N,), and
+    `matrix`, shape (N, N), are the information j and J after the measurements. Return both before the measurements.
     """
     count, size = row.shape
     P, x, gain = P.copy(), np.zeros(size), np.empty(size)
@@ -47,7 +47,7 @@ def before_measurements(
 
 @kernel
 def transition_matrix(speed: float, epoch: Record, unknowns: int) -> Floats:
-    """Return the transition F as a matrix, shape (N, N)."""
+    """Return the transition F to an epoch as a matrix, shape (N, N)."""
     F, matrix = compute_transition(speed, epoch, unknowns), np.zeros((unknowns, unknowns))
     for i in range(unknowns):
         for k in range(3):

@@ -1,8 +1,8 @@
-"""Measurement equations of one epoch, linearised at one Gaussian: rows of H and A in docs/filter-equations.md.
+"""Measurement equations of one epoch, linearised at one Gaussian.
 
-That page has an equation for each kind of row. For the change of a carrier phase, the direction of the chord is used at
-both ends. With the tangent at each end, the phases would determine the absolute position from the bend of the line more
-precisely than the line is known.
+docs/filter-equations.md has the equations of the rows of H and A. For the change of a carrier phase, the direction of
+the chord is used at both ends. With the tangent at each end, the phases would determine the absolute position from the
+bends of the line, more accurately than the line is known.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ class Geometry(NamedTuple):
     point: Floats  #: Position at this epoch, ECEF [m]; shape (3,).
     axes: Floats  #: Tangent, right and up at this epoch's position; shape (3, 3).
     before: Floats  #: Position at the previous epoch, ECEF [m]; shape (3,).
-    #: Direction of the displacement since the previous epoch, or of the tangent when nearly at rest; shape (3,).
+    #: Unit vector of the displacement since the previous epoch, or the tangent if nearly at rest; shape (3,).
     chord: Floats
     distance: Floats  #: Range of each channel with measurements [m]; shape (K,).
     sight: Floats  #: Unit vectors to the satellites, ECEF; shape (K, 3).
     along: Floats  #: Components of `sight` along `axes`; shape (K, 3).
 
 
-#: Unknowns of the distance travelled since the previous epoch, which is s - s' + q_a.
+#: Unknowns s, s' and d_t of the distance travelled since the previous epoch, which is s - s' + d_t.
 DISTANCE = (ix.ARC, ix.PREVIOUS_ARC, ix.MAP_LENGTH_ERROR)
-#: Motion quantities that consist of a single unknown, with this unknown.
+#: Pairs of a motion quantity and the single unknown of which it consists.
 OWN_UNKNOWNS = (
     (ix.M_CLOCK, ix.PHASE_CLOCK), (ix.M_RIGHT, ix.STEP_RIGHT), (ix.M_UP, ix.STEP_UP), (ix.M_DRIFT, ix.DRIFT),
 )  # fmt: skip
@@ -61,9 +61,9 @@ def new_equations(rows: Rows) -> Equations:
 def linearise(
     given: Given, t: int, rows: Rows, x: Floats, at: tuple[float, float], wheel_sign: float, equations: Equations
 ) -> None:
-    """Write the equations of an epoch linearised at the arc lengths `at` of this epoch and the previous one [m].
+    """Write an epoch's equations, linearised at the arc lengths `at` [m] of this epoch and of the previous epoch.
 
-    The innovations refer to the mean x; the difference between x and `at` is added to first order. `wheel_sign` is the
+    The innovations refer to the mean x: the difference between x and `at` is added to first order. `wheel_sign` is the
     result of `find_wheel_sign`.
     """
     geometry = _compute_geometry(given, t, at)
@@ -76,13 +76,13 @@ def linearise(
 
 @inner
 def find_wheel_sign(x: Floats, direction: float) -> float:
-    """Return the sign for an unsigned wheel distance: that of the speed, or of the last speed of known direction."""
+    """Return the sign of an unsigned wheel distance: the sign of the speed, or `direction` if the speed is low."""
     return math.copysign(1.0, x[ix.SPEED]) if abs(x[ix.SPEED]) > constants.DIRECTION_MPS else direction
 
 
 @inner
 def _compute_geometry(given: Given, t: int, at: tuple[float, float]) -> Geometry:
-    """Return points and lines of sight at the arc lengths of this epoch and the previous one [m]."""
+    """Return points and lines of sight at the arc lengths `at` [m] of this epoch and of the previous epoch."""
     point, axes, before, unused = np.empty(3), np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     write_point(given.vertex, given.line[0], at[0], point, axes)
     write_point(given.vertex, given.line[0], at[1], before, unused)
@@ -103,10 +103,9 @@ def _compute_geometry(given: Given, t: int, at: tuple[float, float]) -> Geometry
 
 @inner
 def _write_motion_quantities(first: int, x: Floats, at: tuple[float, float], equations: Equations) -> Floats:
-    """Write the six quantities of phases and Dopplers, from index `first` on; return their values at the mean, shape
-    (6,).
+    """Write the six motion quantities, from index `first` on; return their values at the mean, shape (6,).
 
-    The value of the distance is the offset of the mean from the points at the arc lengths `at`. This value includes the
+    The value of the distance is relative to the distance between the points at the arc lengths `at`. It includes the
     map's length error, because phases measure the distance travelled, not the distance on the map.
     """
     unknown, coefficient, motion = equations.unknown, equations.coefficient, np.empty(ix.MOTION)
@@ -123,9 +122,7 @@ def _write_motion_quantities(first: int, x: Floats, at: tuple[float, float], equ
 def _write_codes(
     given: Given, t: int, rows: Rows, x: Floats, geometry: Geometry, moved: float, equations: Equations
 ) -> None:
-    """Write the codes, each as a row and a quantity of the same index; the mean is `moved` metres beyond the geometry's
-    point.
-    """
+    """Write the codes, each as a row and a quantity with the same index, for a mean `moved` [m] ahead of `geometry`."""
     unknown, coefficient = equations.unknown, equations.coefficient
     for j in range(rows.code.start, rows.code.stop):
         k = rows.channel[j]
@@ -147,7 +144,7 @@ def _write_codes(
 
 @inner
 def _write_motion_value(value: float, j: int, motion: Floats, equations: Equations) -> None:
-    """Write the innovation of a phase or Doppler: measured value minus the value predicted from the mean's motion."""
+    """Write the innovation of a phase or Doppler for the values `motion` of the motion quantities."""
     for a in range(ix.MOTION):
         value -= equations.design[j, a] * motion[a]
     equations.value[j] = value
@@ -182,11 +179,11 @@ def _write_dopplers(given: Given, t: int, rows: Rows, geometry: Geometry, motion
 
 @inner
 def write_range_rate(channel: Record, point: Floats, u: Floats, per_velocity: Floats) -> float:
-    """Return the satellite's part of the range rate [m/s], and write the rate's gradient by the receiver velocity.
+    """Return the satellite's part of the range rate [m/s], and write the rate's derivative by the receiver velocity.
 
-    ``rate = (A + g . v) / (1 + A / c)``: u is the unit vector to the satellite, A the satellite's velocity along u, and
-    g is -u; A and g include the Earth's rotation. `per_velocity` is ``g / (1 + A / c)``. All arrays have the shape
-    (3,).
+    The rate is ``(A + g . v) / (1 + A / c)``, where A is the satellite's velocity along the unit vector u to the
+    satellite, and g is -u. A and g include the Earth's rotation. The derivative `per_velocity` is ``g / (1 + A / c)``.
+    All arrays have the shape (3,).
     """
     sat, velocity = channel.sat_ecef_m, channel.sat_velocity_mps
     moving = u[0] * velocity[0] + u[1] * velocity[1] + u[2] * velocity[2]
@@ -225,7 +222,7 @@ def _write_sensors(given: Given, t: int, rows: Rows, x: Floats, wheel_sign: floa
 
 @inner
 def _write_range(given: Given, t: int, column: int, x: Floats, q: int, equations: Equations) -> float:
-    """Write the equation of a range to a ground unit; return the range predicted from the mean [m]."""
+    """Write the equation of a range to a ground unit, and return the predicted range [m]."""
     sensor, point, axes = given.sensor[t, column], np.empty(3), np.empty((3, 3))
     age, lever = sensor.age_s, sensor.lever_m
     write_point(given.vertex, given.line[0], x[ix.ARC] - age * x[ix.SPEED] + lever[0], point, axes)

@@ -1,4 +1,4 @@
-"""Update of the probabilities of hypotheses, and pruning of hypotheses."""
+"""Probabilities of hypotheses, and pruning of hypotheses."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from railfix.kernels.tracking.line import write_point
 
 @inner
 def log_sum(values: Floats) -> float:
-    """Return the logarithm of the sum of the values' exponentials."""
+    """Return the logarithm of the sum of exponentials."""
     largest = values.max()
     return float(largest + math.log(np.exp(values - largest).sum()))
 
 
 @inner
 def clip_odds(odds: float, gained: float, reach: float) -> float:
-    """Return log odds after a gain, limited to +-`reach` unless the odds were beyond this limit before."""
+    """Return log odds after a gain, limited to +-`reach`, or to the previous odds if these were larger in magnitude."""
     return min(max(odds + gained, min(odds, -reach)), max(odds, reach))
 
 
@@ -31,15 +31,15 @@ def clip_odds(odds: float, gained: float, reach: float) -> float:
 def reweigh(
     parameters: Record, state: State, evidence: Floats, code_evidence: Floats, points: Floats, arc: Floats, dt: float
 ) -> None:
-    """Update the branch probabilities, and the part due to codes, with the evidence of motion and codes.
+    """Update the log probabilities, and the parts of them due to codes, with the evidence of motion and codes.
 
-    docs/filter-equations.md has the bounds of the evidence. Branches within the map error have the same range
-    difference at every epoch. Motion errors are correlated over seconds, so the evidence of motion is multiplied by the
-    interval, at most 1 s. All satellites on one side of a street share code errors for minutes. For laps within `ALIKE`
-    times map_branch_m, the recent evidence of codes is stored as `log_recent`, which only `find_leading` uses.
+    docs/filter-equations.md has the bounds of the evidence. They are required because errors are correlated over
+    epochs: map errors always, motion errors for seconds, and code errors of all satellites on one side of a street for
+    minutes. The evidence of motion is therefore multiplied by the interval, at most 1 s. For laps within `ALIKE` times
+    `map_branch_m`, recent evidence of codes is stored as `log_recent`, which only `find_leading` uses.
 
-    `evidence`, shape (H,), is the log evidence of the motion, and `code_evidence`, shape (H,), that of the codes given
-    the motion. `points`, shape (H, 3), and `arc`, shape (H,), are the positions [m].
+    `evidence` is the log evidence of motion, and `code_evidence` the log evidence of codes given the motion, shape
+    (H,). `points`, shape (H, 3), and `arc`, shape (H,), are the positions [m].
     """
     hypothesis, monitors, count = state.hypothesis, state.monitors[0], len(evidence)
     travel = monitors.branch_m
@@ -74,7 +74,7 @@ def reweigh(
 
 @inner
 def find_leading(hypothesis: Records, count: int) -> int:
-    """Return the hypothesis to report: the first, unless recent codes make another `SWITCH` times as probable."""
+    """Return the hypothesis to report: the first, or another if recent codes make it `SWITCH` times as probable."""
     lead = hypothesis["log_probability"][:count] + hypothesis["log_recent"][:count]
     best = int(np.argmax(lead))
     return best if lead[best] - lead[0] > math.log(constants.SWITCH) else 0
@@ -82,9 +82,9 @@ def find_leading(hypothesis: Records, count: int) -> int:
 
 @inner
 def prune(given: Given, state: State) -> Indices:
-    """Sort the hypotheses, merge duplicates and drop improbable ones; return previous indices of those that remain.
+    """Sort the hypotheses, merge duplicates, drop improbable hypotheses, and return the previous indices of the others.
 
-    Improbable hypotheses are dropped once the first hypothesis has travelled far enough to separate branches by motion.
+    Improbable hypotheses are dropped only after the first one has travelled `DECIDED_TRAVEL_M`.
     """
     count = state.monitors[0].hypotheses
     order = np.argsort(-state.hypothesis["log_probability"][:count], kind="mergesort")
@@ -105,10 +105,11 @@ def prune(given: Given, state: State) -> Indices:
 
 @inner
 def _merge_twins(given: Given, state: State, ranked: Indices) -> tuple[Indices, Floats]:
-    """Return hypotheses and their probabilities, without those within the standard deviations of a more probable one.
+    """Return hypotheses and log probabilities after merging hypotheses with the same position.
 
-    If a hypothesis on another lap has the same position within the map error, the smaller of two standard deviations is
-    the limit. Merging into a wrong position on the same lap would let the next bend contradict only this lap.
+    A hypothesis is merged within the sum of both standard deviations, but only within the smaller of them if a
+    hypothesis on another lap has the same position within the map error. Otherwise a right position could be merged
+    into a wrong position of the same lap, and the next bend would contradict this lap only.
     """
     kept, log_probability, size = np.empty_like(ranked), np.empty(len(ranked)), 0
     arc, points, axes = state.x[: len(ranked), ix.ARC], np.empty((len(ranked), 3)), np.empty((3, 3))

@@ -1,4 +1,4 @@
-"""Points, axes and gradient of the line at an arc length (`railfix.tracking.line.Line`)."""
+"""Points, axes and gradient of the line at an arc length, as in `railfix.tracking.line.Line`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from railfix.kernels.tracking.layout import Record, Records
 
 @inner
 def wrap_arc(vertex: Records, line: Record, arc: float) -> float:
-    """Return the arc length of a position beyond the end of a closed line (`railfix.tracking.line.Line.round_m`)."""
+    """Return the arc length on the line of a position beyond the end of a closed line (`Line.round_m`)."""
     first, last = vertex[0].arc_m, vertex[-1].arc_m
     if arc > last and line.end_turn_m > 0.0:
         return float(arc - math.ceil((arc - last) / line.end_turn_m) * line.end_turn_m)
@@ -24,9 +24,7 @@ def wrap_arc(vertex: Records, line: Record, arc: float) -> float:
 
 @inner
 def nearest_arc(vertex: Records, line: Record, place: float, to: float) -> float:
-    """Return the arc length of a position in the lap nearest to another arc length
-    (`railfix.tracking.line.Line.nearest_m`).
-    """
+    """Return the arc length `place`, shifted by whole laps to be nearest to the arc length `to` (`Line.nearest_m`)."""
     inside = wrap_arc(vertex, line, to)
     nearest = place
     if line.end_turn_m > 0.0 and place >= vertex[-1].arc_m - line.end_turn_m:
@@ -40,7 +38,7 @@ def nearest_arc(vertex: Records, line: Record, place: float, to: float) -> float
 
 @inner
 def write_point(vertex: Records, line: Record, arc: float, point: Floats, axes: Floats) -> None:
-    """Write the point [m] and axes (tangent, right, up) of the line at an arc length; shapes (3,), (3, 3)."""
+    """Write the point [m], shape (3,), and axes (tangent, right, up), shape (3, 3), of the line at an arc length."""
     arc = wrap_arc(vertex, line, arc)
     v = np.searchsorted(vertex["arc_m"][1:-1], arc, side="right")
     here, after = vertex[v], vertex[v + 1]
@@ -59,7 +57,7 @@ def write_point(vertex: Records, line: Record, arc: float, point: Floats, axes: 
 
 @inner
 def gradient_at(vertex: Records, line: Record, arc: float) -> float:
-    """Return the gradient of the line, interpolated linearly between the middles of segments."""
+    """Return the gradient at an arc length, interpolated linearly between segment middles."""
     arc = wrap_arc(vertex, line, arc)
     segments = len(vertex) - 1
     if segments == 1 or arc <= vertex[0].middle_m:

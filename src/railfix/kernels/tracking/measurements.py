@@ -15,14 +15,14 @@ from railfix.kernels.tracking.layout import Given, Rows, State
 from railfix.kernels.tracking.model import restart
 from railfix.kernels.tracking.update import Equations, median
 
-TIE_S = 1e-6  #: Difference below which times are equal [s], because rounding of times depends on the first epoch.
+TIE_S = 1e-6  #: Difference below which times count as equal [s]: their rounding depends on the first epoch.
 
 
 @inner
 def _code_interval_s(given: Given, t: int, state: State) -> float:
-    """Return the time interval that the codes of an epoch represent [s]; 0 where the codes are not used.
+    """Return the interval [s] that an epoch's codes represent: 0 for unused codes, the epoch's interval without codes.
 
-    Codes are not used if phases or Dopplers propagate the position and the period since the last use has not passed.
+    Codes are not used if phases or Dopplers propagate the position and codes have been used within `code_period_s`.
     """
     epoch, period = given.epoch[t], given.parameters[0].code_period_s
     dt, since = epoch.interval_s, epoch.time_s - state.monitors[0].coded_s
@@ -35,7 +35,7 @@ def _code_interval_s(given: Given, t: int, state: State) -> float:
 
 @inner
 def _is_sensor_used(given: Given, t: int, column: int, state: State) -> bool:
-    """Return whether a sensor value is usable: unsigned wheels require a known direction, ranges a minimum speed."""
+    """Return True for a usable value; a distance without a sign requires a known direction, a range a minimum speed."""
     sensor, monitors = given.sensor[t, column], state.monitors[0]
     used = math.isfinite(sensor.value) and (
         column < ix.RANGE_COLUMN or abs(state.x[0, ix.SPEED]) >= constants.STILL_MPS
@@ -84,10 +84,10 @@ def choose_measurements(given: Given, t: int, state: State) -> Rows:
 def start_clocks(
     given: Given, t: int, rows: Rows, offset_known: Masks, x: Floats, P: Floats, equations: Equations, restarted: Masks
 ) -> None:
-    """Start the clocks of an epoch in a predicted Gaussian, and subtract the clocks from the innovations.
+    """Start the clocks of an epoch in a predicted Gaussian, and subtract their changes from the innovations.
 
-    The median innovation of each measurement kind is added to the clock of this kind; clocks that have stepped are
-    restarted. `restarted`, shape (N,), marks the restarted unknowns.
+    The median innovation of codes is added to the code clock. The median innovations of phases and Dopplers are added
+    to the phase clock and the drift if unknown or stepped. `restarted`, shape (N,), is set for restarted unknowns.
     """
     if rows.code.stop > 0:
         first = ix.OFFSETS + given.channel[t, rows.channel[0]].clock
@@ -111,7 +111,7 @@ def _start_code_clocks(
 ) -> bool:
     """Add the median code innovation to the code clock, and the medians of new constellations to the clock offsets.
 
-    At the first epoch, the first constellation defines the code clock. Return whether this is the first epoch.
+    At the first epoch, the first constellation defines the code clock. Return True at the first epoch.
     """
     codes, value = rows.code.stop, equations.value
     clock_of = given.channel[t]["clock"][rows.channel[:codes]]

@@ -1,7 +1,7 @@
-"""Process model: transition F and noise Q of all unknowns between epochs, for filter, sub-filters and smoother.
+"""Process model of filter, sub-filters and smoother: transition F and process noise Q between epochs.
 
-docs/filter-equations.md tabulates F and Q. The standard deviation of the speed grows at every epoch without redundancy.
-Consistent reflections from one wall can then cause a wrong speed, which `narrow_speed_range` limits.
+docs/filter-equations.md tabulates F and Q. While measurements have no redundancy, the standard deviation of the speed
+grows, and consistent reflections from one wall can cause a wrong speed. `narrow_speed_range` limits this error.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from railfix.kernels.tracking.layout import Given, Record, Rows
 from railfix.kernels.tracking.line import write_point
 from railfix.kernels.tracking.update import add_row
 
-#: Minimum variance of displacements and clocks that begin at an epoch [m2], so that none of them is exactly known.
+#: Minimum variances of displacements and of clocks that begin at an epoch [m2], so that covariances are regular.
 _LEAST_M2 = 1e-8
 _LEAST_CLOCK_M2 = 1e-6
 
 
 class Transition(NamedTuple):
-    """Transition F in sparse form, with ``F[i, unknown[i, k]] = coefficient[i, k]``; shapes (N, 3)."""
+    """Transition F in sparse form, with ``F[i, unknown[i, k]] = coefficient[i, k]``; fields have shape (N, 3)."""
 
     unknown: Indices
     coefficient: Floats
@@ -75,7 +75,7 @@ def _multiply(F: Transition, matrix: Floats, product: Floats) -> None:
 
 @inner
 def carry(F: Transition, x: Floats, P: Floats, scratch: Floats) -> None:
-    """Propagate a Gaussian through a transition in place: ``F x``, ``F P F'``; `scratch` (N, N) is overwritten."""
+    """Propagate a Gaussian in place: ``x = F x``, ``P = F P F'``. `scratch`, shape (N, N), is overwritten."""
     before = x.copy()
     for i in range(len(x)):
         x[i] = 0.0
@@ -91,8 +91,8 @@ def predict(
 ) -> None:
     """Predict a Gaussian to epoch t, in place: ``x = F x``, ``P = F P F' + Q``.
 
-    `map_log_variance` is the field of `Monitors`. `wrong_map_m` is a standard deviation of the map [m] in addition to
-    that of `LINE`. `scratch`, shape (N, N), is overwritten.
+    `map_log_variance` is the field of `Monitors`. `wrong_map_m` is an additional standard deviation of the map [m].
+    `scratch`, shape (N, N), is overwritten.
     """
     epoch, speed = given.epoch[t], x[ix.SPEED]
     F = compute_transition(speed, epoch, len(x))
@@ -110,20 +110,20 @@ def _add_noise(
     F: Transition,
     P: Floats,
 ) -> None:
-    """Add the process noise Q of an interval to P; `of_map` has `map_log_variance` and `wrong_map_m` of `predict`."""
+    """Add the process noise Q of an interval to P; `of_map` are `map_log_variance` and `wrong_map_m` of `predict`."""
     dt, travel, (map_log_variance, wrong_map_m) = epoch.interval_s, abs(speed) * epoch.interval_s, of_map
     for i in range(3):
         for j in range(3):
             P[i, j] += epoch.noise[i, j]
     P[ix.ARC, ix.ARC] += constants.LEAST_STEP_M2
     P[ix.SPEED, ix.SPEED] += constants.LEAST_STEP_M2
-    walk = constants.CLOCK_WALK_MPS**2  # of the clock drift; the phase clock is the integral of the drift
+    walk = constants.CLOCK_WALK_MPS**2  # white noise of the drift, whose integral is the phase clock
     P[ix.DRIFT, ix.DRIFT] += walk * dt
     P[ix.PHASE_CLOCK, ix.PHASE_CLOCK] += walk * dt**3 / 3.0 + _LEAST_CLOCK_M2
     P[ix.PHASE_CLOCK, ix.DRIFT] += walk * dt**2 / 2.0
     P[ix.DRIFT, ix.PHASE_CLOCK] += walk * dt**2 / 2.0
     P[ix.CODE_CLOCK, ix.CODE_CLOCK] = constants.CODE_CLOCK_SIGMA_M**2
-    # Gauss-Markov: sigma^2 (1 - kept^2)
+    # Gauss-Markov processes: sigma^2 (1 - F^2)
     changed = 1.0 - F.coefficient[ix.MAP_RIGHT, 0] ** 2
     P[ix.MAP_RIGHT, ix.MAP_RIGHT] += (line.sigma_plan_m**2 + wrong_map_m**2) * changed
     P[ix.MAP_UP, ix.MAP_UP] += (line.sigma_height_m**2 + wrong_map_m**2) * changed
@@ -138,7 +138,7 @@ def _add_noise(
     P[ix.RADAR, ix.RADAR] += constants.RADAR_WALK**2 * dt
     for i in range(ix.OFFSETS, ix.SATELLITES):
         P[i, i] += constants.OFFSET_WALK_M**2 * dt
-    # map displacement over the interval
+    # error of the map's displacement over the interval
     changed = 2.0 * (1.0 - math.exp(-travel / constants.MAP_CORRELATION_M))
     across = max(constants.MAP_ROUGHNESS_M, line.sigma_plan_m)
     above = max(constants.MAP_ROUGHNESS_M, constants.HEIGHT_ROUGHNESS * line.sigma_height_m)
@@ -153,7 +153,7 @@ def _add_noise(
 
 @inner
 def add_bend(given: Given, at: tuple[float, float], P: Floats) -> None:
-    """Add to the lateral displacements the deviation of the curved line from its tangent over the position uncertainty.
+    """Increase the variances of lateral displacements where a position error in a bend changes the displacement.
 
     `at` has the arc lengths at this epoch and at the previous epoch [m].
     """
@@ -169,7 +169,7 @@ def add_bend(given: Given, at: tuple[float, float], P: Floats) -> None:
 
 @inner
 def restart(P: Floats, unknown: int, variance: float) -> None:
-    """Make an unknown independent of all others, with a given variance."""
+    """Make an unknown independent of all other unknowns, with a given variance."""
     for c in range(len(P)):
         P[unknown, c] = P[c, unknown] = 0.0
     P[unknown, unknown] = variance
@@ -177,12 +177,12 @@ def restart(P: Floats, unknown: int, variance: float) -> None:
 
 @inner
 def narrow_speed_range(parameters: Record, monitors: Record, rows: Rows, speed: float, sigma: float, dt: float) -> bool:
-    """Return whether a measured speed is possible after the previous speeds, and narrow the range of possible speeds.
+    """Return True if a measured speed is possible after the previous speeds, and narrow the range of possible speeds.
 
-    With several branches, the range has no bounds. Speeds from enough satellites, from codes alone, or supported by an
-    on-board sensor, are accepted even outside the range. After a rejected speed, the range grows by emergency braking,
-    so that braking is followed from the next epoch on. Without a measurement, `sigma` is infinite, and the range grows
-    by service braking.
+    With several hypotheses, the range is unbounded. A speed outside the range is accepted if it comes from enough
+    satellites or from codes alone, or if an on-board sensor has measurements. After a rejected speed, the range grows
+    by emergency braking, so that braking is followed from the next epoch on. Without a measurement, `sigma` is
+    infinite, and the range grows by `service_acceleration_mps2`.
     """
     low, high = -math.inf, math.inf
     if monitors.hypotheses == 1:

@@ -1,6 +1,6 @@
-"""Monitors of the filter's position: velocity across the line, the open end of a map, a step of all codes.
+"""Monitors of the filter's position: velocity across the line, open ends of the map, steps of all codes.
 
-If a monitor contradicts the position, the protection level is withheld. If the contradiction persists, the track is
+The protection level is withheld if a monitor contradicts the position. If the contradiction persists, the track is
 lost, and the whole line is searched.
 """
 
@@ -20,10 +20,10 @@ from railfix.kernels.tracking.subfilters import find_other
 
 @inner
 def compute_contradiction(given: Given, t: int, state: State, h: int) -> float:
-    """Return the squared difference between measured velocity and line, over its variance; NaN without a velocity.
+    """Return the squared normalised difference between measured velocity and line; NaN without a velocity.
 
-    The difference is computed along and across the line, at three positions about the estimate; the smallest is
-    returned.
+    The square is the sum of the components along and across the line. It is computed at the estimated position and at
+    one position ahead and behind; the smallest value is returned.
     """
     epoch, line, x, P = given.epoch[t], given.line[0], state.x[h], state.P[h]
     velocity, covariance = epoch.velocity_mps, epoch.velocity_covariance
@@ -49,9 +49,8 @@ def update_monitors(
 ) -> None:
     """Update the monitors with the contradictions of an epoch.
 
-    For the reported hypothesis, `contradiction` is the result of `compute_contradiction`, `shift` the shift implied by
-    codes, and `beyond_m` the distance beyond an open end of the line. `code_s` is the interval that the codes represent
-    [s].
+    `contradiction`, `shift` and `beyond_m` are the results of `compute_contradiction`, `compute_code_shift` and
+    `excess_beyond_end` for the reported hypothesis. `code_s` is the interval that the codes represent [s].
     """
     monitors = state.monitors[0]
     if not math.isnan(contradiction):
@@ -79,7 +78,7 @@ def update_monitors(
 
 @inner
 def _is_doubtful(monitors: Record) -> bool:
-    """Return whether codes, motion or the velocity across the line contradict the position."""
+    """Return True if codes, motion or the velocity across the line contradict the position."""
     return bool(
         monitors.weak_code_s > constants.LEVEL_DOUBT_CODE_S
         or monitors.weak_motion_s > constants.LEVEL_DOUBT_S
@@ -90,7 +89,7 @@ def _is_doubtful(monitors: Record) -> bool:
 
 @inner
 def _is_contradicted_by_subfilter(state: State) -> bool:
-    """Return whether measurements contradict a sub-filter, or that for a wrong map shows a lateral displacement."""
+    """Return True if measurements contradict a sub-filter, or if the map has a significant lateral displacement."""
     if (state.source["running"] & (state.source["contradicted_s"] > constants.LEVEL_DOUBT_S)).any():
         return True
     wrong = find_other(state, ix.WRONG_MAP)

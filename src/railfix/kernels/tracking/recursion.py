@@ -1,8 +1,8 @@
-"""The filter along the track, epoch by epoch.
+"""Recursion of the along-track filter over epochs.
 
-The steps of an epoch are: predict, choose measurements, correct each hypothesis, reweigh hypotheses, adapt and monitor,
-correct the sub-filters, prune, and write level and status. The position search (`railfix.tracking.search`) is outside
-the recursion, between the prediction and the update of an epoch.
+The steps of an epoch are: predict, choose measurements, correct each hypothesis, reweigh hypotheses, adapt, correct the
+sub-filters, monitor, prune, and write level and status. The position search (`railfix.tracking.search`) takes place
+outside the recursion, between prediction and update of an epoch.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from railfix.kernels.tracking.update import (
 
 @inner
 def _find_search_reasons(given: Given, t: int, state: State) -> int:
-    """Return the reasons for a position search before an epoch, as bits (`index.LOST_TRACK`, ...); 0 without any."""
+    """Return the reasons for a position search before an epoch, as bits (`index.LOST_TRACK`, ...); 0 for none."""
     epoch, parameters, monitors = given.epoch[t], given.parameters[0], state.monitors[0]
     lost = monitors.weak_motion_s >= constants.LOST_MOTION_S or monitors.weak_code_s >= constants.LOST_CODE_S
     lost = lost or monitors.contradiction >= constants.CONTRADICTION_LOST
@@ -54,7 +54,7 @@ def _find_search_reasons(given: Given, t: int, state: State) -> int:
 
 @inner
 def _reset_code_errors(given: Given, t: int, state: State) -> None:
-    """Make the code errors of satellites that come into view independent of all other unknowns."""
+    """Restart the code errors of satellites that come into view."""
     for i in range(given.fresh.shape[1]):
         if given.fresh[t, i]:
             state.code_bias[i] = 0.0
@@ -65,7 +65,7 @@ def _reset_code_errors(given: Given, t: int, state: State) -> None:
 
 @inner
 def _wrap_closed_line(given: Given, state: State) -> None:
-    """Wrap positions beyond an end of a closed line."""
+    """Shift positions beyond an end of a closed line by a lap."""
     for h in range(state.monitors[0].hypotheses):
         back = wrap_arc(given.vertex, given.line[0], state.x[h, ix.ARC]) - state.x[h, ix.ARC]
         if back != 0.0:
@@ -89,7 +89,7 @@ def _predict_all(given: Given, t: int, state: State) -> None:
 
 @inner
 def _start_correction(given: Given, t: int, state: State, rows: Rows, h: int) -> Correction:
-    """Start the correction of a predicted hypothesis with the equations and innovations."""
+    """Return the correction of a predicted hypothesis before the first fit, with its equations and innovations."""
     x, P, equations = state.x[h].copy(), state.P[h].copy(), new_equations(rows)
     restarted = np.zeros(len(x), dtype=np.bool_)
     sign = find_wheel_sign(x, state.monitors[0].direction)
@@ -104,9 +104,9 @@ def _start_correction(given: Given, t: int, state: State, rows: Rows, h: int) ->
 
 @inner
 def _correct_hypotheses(given: Given, t: int, state: State, rows: Rows) -> tuple[list[Correction], float]:
-    """Return the corrections of all hypotheses, and the shift that codes imply for the hypothesis reported so far.
+    """Return the corrections of all hypotheses, and the code shift of the hypothesis reported so far.
 
-    The equations are linearised again at the corrected position as long as it moves by more than `MOVED_M`.
+    The equations are linearised again as long as a corrected position moves by more than `MOVED_M`.
     """
     count = state.monitors[0].hypotheses
     corrections = [_start_correction(given, t, state, rows, h) for h in range(count)]
@@ -137,7 +137,7 @@ def _correct_hypotheses(given: Given, t: int, state: State, rows: Rows) -> tuple
 
 @inner
 def _relinearise(given: Given, t: int, state: State, rows: Rows, one: Correction) -> float:
-    """Linearise again at the corrected position and correct again; return the further change of the position [m]."""
+    """Correct again with equations linearised at the corrected position; return the change of this position [m]."""
     arc, sign = one.x[ix.ARC], find_wheel_sign(one.x_prior, state.monitors[0].direction)
     linearise(given, t, rows, one.x_prior, (arc, one.x[ix.PREVIOUS_ARC]), sign, one.equations)
     covariance, without_clock = predict_quantities(one.P_prior, one.equations)
@@ -150,7 +150,7 @@ def _relinearise(given: Given, t: int, state: State, rows: Rows, one: Correction
 
 @inner
 def _reweigh_hypotheses(given: Given, t: int, state: State, rows: Rows, corrections: list[Correction]) -> None:
-    """Update the probabilities of the hypotheses with the evidence of an epoch."""
+    """Update the probabilities of hypotheses with the evidence of an epoch."""
     count = len(corrections)
     motion, code, arc = np.empty(count), np.empty(count), np.empty(count)
     points, axes = np.empty((count, 3)), np.empty((3, 3))
@@ -163,7 +163,7 @@ def _reweigh_hypotheses(given: Given, t: int, state: State, rows: Rows, correcti
 
 @inner
 def _commit_update(given: Given, t: int, state: State, rows: Rows, corrections: list[Correction], shift: float) -> int:
-    """Store the corrected hypotheses, adapt, monitor, and correct the sub-filters; return the leading hypothesis."""
+    """Store the corrected hypotheses, adapt, correct the sub-filters, and monitor; return the leading hypothesis."""
     monitors = state.monitors[0]
     for h, one in enumerate(corrections):
         state.x[h], state.P[h] = one.x, one.P
@@ -178,7 +178,7 @@ def _commit_update(given: Given, t: int, state: State, rows: Rows, corrections: 
     excluded = adapt(given, t, state, rows, best.fit, best.innovation, implied)
     if len(state.source):
         advance_subfilters(given, t, state, rows, best, leading)
-    # the codes of the excluded satellite have affected the position so far
+    # the codes of the newly excluded satellite have affected the position so far
     if excluded and abs(shift) < constants.INFLATED_SIGMAS:
         state.P[:, ix.ARC, ix.ARC] += constants.INFLATED_M**2
     contradiction = compute_contradiction(given, t, state, leading)
@@ -189,7 +189,7 @@ def _commit_update(given: Given, t: int, state: State, rows: Rows, corrections: 
 
 @inner
 def _write_measurements(t: int, rows: Rows, one: Correction, believed: bool, results: Results) -> None:
-    """Write innovations and weights of the measurements; all weights are 0 if the measurements are not accepted."""
+    """Write innovations and weights; all weights are 0 if the measurements are not accepted (`believed`)."""
     result, weight = results.epoch[t], one.fit.weight
     factor = 1.0 if believed else 0.0
     code, motion = mean_weights(rows, rows.variance, weight)
@@ -228,7 +228,7 @@ def _write_trace(rows: Rows, corrections: list[Correction], trace: Trace) -> Non
 
 @inner
 def _finish(given: Given, t: int, leading: int, state: State, trace: Trace) -> None:
-    """Update the direction and the time and distance on the branches, and prune the hypotheses."""
+    """Update direction of travel, and time and distance since the start of the hypotheses; prune the hypotheses."""
     monitors, dt = state.monitors[0], given.epoch[t].interval_s
     speed = state.x[leading, ix.SPEED]
     if abs(speed) > constants.DIRECTION_MPS:
@@ -249,7 +249,7 @@ def _finish(given: Given, t: int, leading: int, state: State, trace: Trace) -> N
 
 @inner
 def _write_place(given: Given, t: int, status: int, state: State, results: Results) -> None:
-    """Write position, speed, level and status; `status` does not yet consider doubt and other branches."""
+    """Write position, speed, levels and status. `status` is replaced if other branches or doubts exist."""
     parameters, monitors, result = given.parameters[0], state.monitors[0], results.epoch[t]
     x, P = state.x[0], state.P[0]
     sigma = math.sqrt(P[ix.ARC, ix.ARC])
@@ -288,7 +288,7 @@ def _write_place(given: Given, t: int, status: int, state: State, results: Resul
 
 @inner
 def _advance_epoch(given: Given, t: int, state: State, results: Results, trace: Trace, lost: bool) -> None:
-    """Process an epoch to which the state has been predicted."""
+    """Process an epoch to which the state has already been predicted."""
     monitors, dt, leading = state.monitors[0], given.epoch[t].interval_s, 0
     rows = choose_measurements(given, t, state)
     believed = len(rows.variance) > 0  # without measurements, there is only the prediction
@@ -323,11 +323,11 @@ def _advance_epoch(given: Given, t: int, state: State, results: Results, trace: 
 def advance(
     given: Given, state: State, results: Results, trace: Trace, span: tuple[int, int], sought: int
 ) -> tuple[int, int]:
-    """Process a span of epochs; return the first epoch that requires a position search and the reasons, or the end and
-    0.
+    """Process a span of epochs; return the epoch at which the recursion stopped, and reasons for a position search.
 
-    At the epoch of the search, the state is only predicted; a call for this epoch alone with `index.SOUGHT` completes
-    it. An epoch with a restart is returned with 0, and so is the epoch after an epoch without a finite position.
+    The recursion stops at an epoch that requires a position search, to which the state is only predicted. A call for
+    this epoch alone with `index.SOUGHT` completes it. The recursion also stops at a restart, after an epoch without a
+    finite position, and at the end of the span, with 0 as reasons.
     """
     for t in range(span[0], span[1]):
         if sought == ix.NOT_SOUGHT:

@@ -1,8 +1,8 @@
 """Sub-filters for the protection level, each of which excludes one source of measurements.
 
-Each sub-filter runs the same recursion as the filter, without one source (a satellite, a constellation, a sensor, all
-Dopplers, all phases, the codes of all satellites ahead or behind) or with a possibly wrong map. A sub-filter has a
-separate state from the start on, so that a fault of the excluded source never affects this state.
+Each sub-filter is updated like the filter, without one source (a satellite, a constellation, a sensor, all Dopplers,
+all phases, the codes of all satellites ahead or behind) or with a possibly wrong map. A sub-filter has its own state
+from the start on, so that a fault of the excluded source never affects this state.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from railfix.kernels.tracking.update import (
 
 @inner
 def find_other(state: State, which: int) -> int:
-    """Return the index of one of the sources after the sensors (`index.ALL_DOPPLERS` and later ones).
+    """Return the index in `State.source` of `index.ALL_DOPPLERS` or one of the following sources.
 
     The index is negative if levels are off.
     """
@@ -44,9 +44,7 @@ def find_other(state: State, which: int) -> int:
 
 @inner
 def _find_needed(given: Given, t: int, rows: Rows, state: State) -> Masks:
-    """Return which sources an epoch's measurements have, shape (B,); constellations are included only if there are
-    several.
-    """
+    """Return True for the sources of an epoch's measurements, shape (B,). A single constellation is not included."""
     needed, satellites = np.zeros(len(state.source), dtype=np.bool_), len(state.code_bias)
     others = find_other(state, ix.ALL_DOPPLERS)
     constellations = 0
@@ -69,12 +67,12 @@ def _find_needed(given: Given, t: int, rows: Rows, state: State) -> Masks:
 
 @inner
 def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Correction, leading: int) -> None:
-    """Correct all sub-filters after their prediction; `leading` is the leading hypothesis, `best` its correction.
+    """Correct the predicted sub-filters; `leading` is the index of the leading hypothesis, `best` its correction.
 
     Each sub-filter has separate equations, because the line may bend between the positions of sub-filter and filter. A
-    sub-filter that is contradicted by measurements restarts. For a source that the filter has not yet used, the filter
-    itself serves as sub-filter. If all restart, a sub-filter with all satellites in view also restarts, and serves
-    satellite pairs until it equals the filter.
+    sub-filter that measurements contradict restarts. For a source that the filter has not yet used, a copy of the
+    filter is the sub-filter. If all sub-filters restart, a sub-filter with all satellites in view restarts, too. It is
+    the reference for satellite pairs until it equals the filter.
     """
     source, first, satellites = state.source, len(state.hypothesis), len(state.code_bias)
     all_in_view = find_other(state, ix.ALL_IN_VIEW)
@@ -83,7 +81,7 @@ def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Cor
     needed[all_in_view] = not before
     absorbed = np.zeros(len(source), dtype=np.bool_)
     for k in range(satellites):
-        if given.within_memory[t, k]:  # the hypothesis has already used this source, if it has no sub-filter so far
+        if given.within_memory[t, k]:  # the hypothesis has already used this source
             absorbed[satellites + source[k].clock] = True
             needed[k] = needed[k] or not before
     sign = find_wheel_sign(best.x_prior, state.monitors[0].direction)
@@ -121,7 +119,7 @@ def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Cor
 
 @inner
 def _has_joined(x: Floats, P: Floats, best: Correction) -> bool:
-    """Return whether a sub-filter equals the filter, that is, position and sigma agree within `JOINED`."""
+    """Return True if position and sigma of a sub-filter and of the filter agree within `JOINED`."""
     sigma = math.sqrt(P[ix.ARC, ix.ARC])
     near = abs(x[ix.ARC] - best.x_prior[ix.ARC]) < constants.JOINED * sigma
     return near and sigma < (1.0 + constants.JOINED) * math.sqrt(best.P_prior[ix.ARC, ix.ARC])
@@ -129,10 +127,9 @@ def _has_joined(x: Floats, P: Floats, best: Correction) -> bool:
 
 @inner
 def _has_diverged(clock: int, P: Floats, variance: Floats) -> bool:
-    """Return whether a sub-filter that excludes the constellation `clock` of `CLOCKS` has no measurements left.
+    """Return True if a sub-filter without the constellation `clock` of `CLOCKS` no longer has measurements.
 
-    The position is then as uncertain as at a start, and gives no bound
-    (`railfix.kernels.tracking.level.find_unchecked`).
+    Its position is as uncertain as at a start, and gives no bound (`railfix.kernels.tracking.level.find_unchecked`).
     """
     lost = 0 <= clock < ix.CLOCK_COUNT and math.sqrt(P[ix.ARC, ix.ARC]) > constants.START_SIGMA_M
     return lost and not np.isfinite(variance).any()
@@ -140,7 +137,7 @@ def _has_diverged(clock: int, P: Floats, variance: Floats) -> bool:
 
 @inner
 def _begin(given: Given, state: State, b: int, copied: bool, best: Correction) -> None:
-    """Start a sub-filter with the state of the filter, or with the filter's position only."""
+    """Start a sub-filter with the state of the filter if `copied`, otherwise with the filter's position only."""
     row = len(state.hypothesis) + b
     x, P = state.x[row], state.P[row]
     state.source[b].running, state.source[b].contradicted_s = True, 0.0
@@ -158,10 +155,10 @@ def _begin(given: Given, state: State, b: int, copied: bool, best: Correction) -
 
 @inner
 def rotate_map_error(given: Given, x: Floats, P: Floats) -> None:
-    """Rotate the displacement of a possibly wrong map with the line; after a bend, lateral becomes along the line.
+    """Rotate the displacement of a possibly wrong map relative to the line.
 
-    The rotation affects the distance on the map, not the distance measured by phases. The component that was along the
-    line before is unknown.
+    In a bend, a lateral displacement of the map becomes a displacement along the line. It changes the distance on the
+    map, not the distance measured by phases. The component that was along the line before the bend is unknown.
     """
     axes, before, point = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     write_point(given.vertex, given.line[0], x[ix.ARC], point, axes)
@@ -177,10 +174,10 @@ def rotate_map_error(given: Given, x: Floats, P: Floats) -> None:
 
 @inner
 def _exclude_source(given: Given, t: int, rows: Rows, state: State, b: int, equations: Equations) -> Floats:
-    """Return the variances of the measurements for a sub-filter, infinite for the excluded source, shape (M,).
+    """Return the variances of the measurements for sub-filter `b`, shape (M,); infinite for the excluded source.
 
-    Measurements of infinite variance are not used. `equations` are those of the leading hypothesis; the sign of the
-    arc-length coefficients distinguishes satellites ahead from satellites behind.
+    Measurements of infinite variance are not used. `equations` are the equations of the leading hypothesis. Their
+    arc-length coefficients distinguish satellites ahead from satellites behind.
     """
     satellites, others, variance = len(state.code_bias), find_other(state, ix.ALL_DOPPLERS), rows.variance.copy()
     if b < satellites + ix.CLOCK_COUNT:
@@ -199,7 +196,7 @@ def _exclude_source(given: Given, t: int, rows: Rows, state: State, b: int, equa
     elif b in (others + ix.CODES_AHEAD, others + ix.CODES_BEHIND):
         side = 1.0 if b == others + ix.CODES_AHEAD else -1.0
         for j in range(rows.code.start, rows.code.stop):
-            if side * equations.coefficient[j, 0] < -constants.AHEAD:  # moving forward shortens the range
+            if side * equations.coefficient[j, 0] < -constants.AHEAD:  # forward motion shortens the range
                 variance[j] = math.inf
     return variance
 
@@ -208,7 +205,7 @@ def _exclude_source(given: Given, t: int, rows: Rows, state: State, b: int, equa
 def _correct(
     given: Given, t: int, rows: Rows, variance: Floats, best: Correction, x: Floats, P: Floats, sign: float
 ) -> Fit:
-    """Correct a predicted sub-filter (x, P) in place, with the clocks that the filter has started."""
+    """Correct a predicted sub-filter (x, P) in place, with the initial clocks of the filter."""
     equations, found = new_equations(rows), new_fit(rows)
     for i in range(len(x)):
         if best.restarted[i]:
@@ -227,13 +224,13 @@ def _correct(
 
 @inner
 def _update_contradiction(given: Given, t: int, rows: Rows, state: State, b: int, variance: Floats, found: Fit) -> None:
-    """Update the time for which low weights of the measurements have contradicted a sub-filter."""
+    """Update the time for which low measurement weights have contradicted sub-filter `b`."""
     one = state.source[b]
     code, motion = mean_weights(rows, variance, found.weight)
     if code < constants.LOST_CODE_WEIGHT or motion < constants.LOST_MOTION_WEIGHT:
         one.contradicted_s += given.epoch[t].interval_s
     elif rows.code.stop > 0:
         one.contradicted_s = 0.0
-    # the sub-filter will restart, and gives no bound until then
+    # a diverged sub-filter gives no bound until it restarts
     if not math.isfinite(state.x[len(state.hypothesis) + b, ix.ARC]):
         one.contradicted_s = constants.LOST_MOTION_S + constants.LEVEL_DOUBT_S

@@ -1,10 +1,10 @@
-"""Sequential correction of Gaussians with the measurements of an epoch, whose errors have Student's t distribution.
+"""Sequential correction of Gaussians by an epoch's measurements with Student's t errors.
 
-The measurements depend on a Gaussian N(x, P) through the quantities ``q = H x`` of docs/filter-equations.md. Rounds of
-reweighting correct the Gaussian of the quantities, N(0, H P H'), instead of the state. All phases and Dopplers are
-compressed to six rows. Measurements are processed one by one with a division each, so that no matrix is inverted.
+The measurements depend on a Gaussian N(x, P) through the quantities ``q = H x`` of docs/filter-equations.md. The fits
+correct the Gaussian of the quantities, N(0, H P H'), instead of the state. All phases and Dopplers are compressed to
+six rows. Measurements are processed one by one, so that no matrix is inverted.
 
-Two named tuples of array views belong to each Gaussian: `Equations` has the measurements, `Fit` the results.
+Each Gaussian has two named tuples of arrays: `Equations` for the measurements, `Fit` for the results.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from railfix.kernels.tracking.layout import Rows
 class Equations(NamedTuple):
     """Measurement equations of one Gaussian with N unknowns: Q quantities and M measurements."""
 
-    #: Quantity q is the sum of ``coefficient[q, k] x[unknown[q, k]]``, with the clock last; shapes (Q, TERMS).
+    #: Quantity q is the sum over k of ``coefficient[q, k] x[unknown[q, k]]``, with the clock last; shapes (Q, TERMS).
     unknown: Indices
     coefficient: Floats
     #: Coefficients of phases and Dopplers for the six motion quantities; 0 for other rows; shape (M, MOTION).
@@ -33,43 +33,43 @@ class Equations(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """Fit of one Gaussian to an epoch's measurements; fields have shape (M,), the last two (1,)."""
+    """Fit of one Gaussian to an epoch's measurements. Fields have shape (M,), the last two fields (1,)."""
 
-    #: Weight by Student's t, no unit; 1 at an error of one standard deviation, less for a late code.
+    #: Weight by Student's t distribution; 1 at an error of one standard deviation, less for a late code.
     weight: Floats
-    residual: Floats  #: Innovation minus its prediction from the corrected quantities, in the unit of the measurement.
-    fitted: Floats  #: Variance of this prediction, in the squared unit.
+    residual: Floats  #: Innovation minus its fitted value, in the unit of the measurement.
+    fitted: Floats  #: Variance of the fitted value, in the squared unit.
     log_determinant: Floats  #: ``log det(I + R^-1 H P H')``.
-    distance: Floats  #: ``q' (H P H')^-1 q`` of the corrected mean q of the quantities.
+    distance: Floats  #: ``q' (H P H')^-1 q``, with the corrected mean q of the quantities.
 
 
 class Correction(NamedTuple):
-    """Correction of one hypothesis at an epoch: N unknowns, M measurements."""
+    """Correction of one hypothesis with N unknowns by M measurements of an epoch."""
 
-    #: Predicted mean and covariance after the start of the epoch's clocks; shapes (N,), (N, N).
+    #: Predicted mean and covariance, with started clocks; shapes (N,) and (N, N).
     x_prior: Floats
     P_prior: Floats
     equations: Equations
-    #: Covariance of the quantities before the measurements, and the diagonal without the clocks; shapes (Q, Q), (Q,).
+    #: Prior covariance of the quantities, shape (Q, Q), and its diagonal without the clocks, shape (Q,).
     covariance: Floats
     without_clock: Floats
     fit: Fit
     innovation: Floats  #: Innovations at the predicted mean; shape (M,).
     restarted: Masks  #: Unknowns (clocks) that restarted at this epoch; shape (N,).
-    #: Corrected mean and covariance; shapes (N,), (N, N).
+    #: Corrected mean and covariance; shapes (N,) and (N, N).
     x: Floats
     P: Floats
 
 
 @inlined
 def find_row(rows: Rows, q: int) -> int:
-    """Return the row of the quantity of a code or sensor; the six motion quantities have no row."""
+    """Return the row of a code or sensor quantity; motion quantities have no row."""
     return q if q < rows.code.stop else q - rows.code.stop - ix.MOTION + rows.sensor.start
 
 
 @inlined
 def find_quantity(rows: Rows, j: int) -> int:
-    """Return the quantity of a code or sensor row: codes first, then the six motion quantities, then sensors."""
+    """Return the quantity of a code or sensor row. The order is codes, six motion quantities, sensors."""
     return j if j < rows.code.stop else j - rows.sensor.start + rows.code.stop + ix.MOTION
 
 
@@ -82,17 +82,17 @@ def new_fit(rows: Rows) -> Fit:
 
 @inlined
 def add_row(target: Floats, factor: float, matrix: Floats, i: int) -> None:
-    """Add a multiple of row i of a matrix to a vector, without a view of the row, which costs more than the sum."""
+    """Add a multiple of row i of a matrix to a vector; a view of the row would cost more time than the sum."""
     for a in range(len(target)):
         target[a] += factor * matrix[i, a]
 
 
 @inlined
 def correct(x: Floats, P: Floats, g: Floats, innovation: float, variance: float, gain: Floats) -> None:
-    """Correct a Gaussian by one measurement: ``K = g / S``, ``x + K y``, ``P - K g'``.
+    """Correct a Gaussian by one measurement: ``K = g / S``, ``x = x + K y``, ``P = P - K g'``.
 
-    x, shape (N,), and P, shape (N, N), are changed. g, shape (N,), is P h; y is the innovation and ``S = h' P h + r``
-    the variance of y. K is written into `gain`, shape (N,).
+    x, shape (N,), and P, shape (N, N), are changed in place. g, shape (N,), is P h. `innovation` is y, `variance` is
+    ``S = h' P h + r``. K is written into `gain`, shape (N,).
     """
     for a in range(len(g)):
         gain[a] = g[a] / variance
@@ -106,7 +106,7 @@ def correct(x: Floats, P: Floats, g: Floats, innovation: float, variance: float,
 
 @inner
 def predict_quantities(P: Floats, equations: Equations) -> tuple[Floats, Floats]:
-    """Return the covariance H P H' of the quantities, and the diagonal without the clocks; shapes (Q, Q), (Q,)."""
+    """Return the covariance H P H' of the quantities, shape (Q, Q), and its diagonal without the clocks, shape (Q,)."""
     unknown, coefficient = equations.unknown, equations.coefficient
     size = len(unknown)
     covariance, without_clock, g = np.empty((size, size)), np.empty(size), np.empty(len(P))
@@ -127,10 +127,9 @@ def predict_quantities(P: Floats, equations: Equations) -> tuple[Floats, Floats]
 
 @inner
 def compress(rows: Rows, equations: Equations, variance: Floats, weight: Floats, T: Floats, z: Floats) -> None:
-    """Write the six rows ``T q_motion = z + N(0, I)`` that are equivalent to all phases and Dopplers at their weights.
+    """Write the six rows ``T q_motion = z + N(0, I)`` that are equivalent to all weighted phases and Dopplers.
 
-    ``T' T`` is the Cholesky factorisation of the normal matrix of phases and Dopplers, and T is upper triangular. Rows
-    of unmeasured quantities are 0.
+    T is the upper triangular Cholesky factor of the normal matrix ``T' T``. Rows of unmeasured quantities are 0.
     """
     design, value = equations.design, equations.value
     diagonal = np.empty(ix.MOTION)
@@ -161,14 +160,14 @@ def compress(rows: Rows, equations: Equations, variance: Floats, weight: Floats,
 
 @inner
 def compute_weight(rows: Rows, square: float, late: bool) -> float:
-    """Return the weight of a measurement from its normalised square (`railfix.tracking.limits.Tails`)."""
+    """Return the weight for a normalised squared residual, as in `railfix.tracking.limits.Tails`."""
     own = rows.late_degrees if late else rows.degrees
     return float((rows.degrees + 1.0) / rows.degrees * own / (own + square))
 
 
 @inner
 def median(values: Floats) -> float:
-    """Return the median of values; NaN without values."""
+    """Return the median; NaN without values."""
     return float(np.median(values)) if len(values) else math.nan
 
 
@@ -176,9 +175,9 @@ def median(values: Floats) -> float:
 def write_first_weights(
     rows: Rows, equations: Equations, expected: tuple[Floats, Floats], variance: Floats, weight: Floats
 ) -> None:
-    """Write the initial weights, computed from the innovations minus the median of each GNSS measurement kind.
+    """Write the initial weights, computed from innovations minus their median per GNSS measurement kind.
 
-    The variances exclude the clocks, because the prior of the clocks would hide every outlier.
+    The variances exclude the clocks, whose large prior variances would hide every outlier.
     """
     covariance, without_clock = expected
     design, value, codes = equations.design, equations.value, rows.code.stop
@@ -204,7 +203,7 @@ def write_first_weights(
 
 @inner
 def fit(rows: Rows, equations: Equations, covariance: Floats, variance: Floats, found: Fit) -> None:
-    """Correct the quantities, ``N(0, covariance)``, with the weights of `found`, and write its other fields."""
+    """Correct the quantities, ``N(0, covariance)``, with the weights of `found`; write the fit into `found`."""
     size, codes, value, weight = len(covariance), rows.code.stop, equations.value, found.weight
     mean, C, g, gain = np.zeros(size), covariance.copy(), np.empty(size), np.empty(size)
     T, z = np.empty((ix.MOTION, ix.MOTION)), np.empty(ix.MOTION)
@@ -241,7 +240,7 @@ def fit(rows: Rows, equations: Equations, covariance: Floats, variance: Floats, 
 
 @inner
 def _write_residuals(rows: Rows, equations: Equations, mean: Floats, C: Floats, variance: Floats, found: Fit) -> float:
-    """Write residuals and variances of the fitted measurements; return the weighted square sum of codes and sensors."""
+    """Write the residuals and `Fit.fitted`; return the weighted sum of squared residuals of codes and sensors."""
     design, value, codes, square = equations.design, equations.value, rows.code.stop, 0.0
     for j in range(len(rows.variance)):
         residual, fitted = value[j], 0.0
@@ -261,7 +260,7 @@ def _write_residuals(rows: Rows, equations: Equations, mean: Floats, C: Floats, 
 
 @inner
 def write_weights(rows: Rows, variance: Floats, found: Fit) -> None:
-    """Write the weights that follow from the residuals of a fit and the variances of the residuals."""
+    """Write the weights that follow from `Fit.residual` and `Fit.fitted`."""
     for j in range(len(rows.variance)):
         relative = (found.residual[j] ** 2 + found.fitted[j]) / variance[j]
         late = j < rows.code.stop and found.residual[j] > 0.0
@@ -270,9 +269,9 @@ def write_weights(rows: Rows, variance: Floats, found: Fit) -> None:
 
 @inner
 def reweight(rows: Rows, equations: Equations, covariance: Floats, variance: Floats, found: Fit) -> None:
-    """Alternate `PASSES` fits and reweightings, starting from the weights of `found`.
+    """Make `PASSES` fits with new weights between them, starting from the weights of `found`.
 
-    `found` keeps the weights and the residuals of the last fit.
+    `found` has the weights and residuals of the last fit.
     """
     fit(rows, equations, covariance, variance, found)
     for _ in range(constants.PASSES - 1):
@@ -282,7 +281,7 @@ def reweight(rows: Rows, equations: Equations, covariance: Floats, variance: Flo
 
 @inner
 def correct_state(rows: Rows, equations: Equations, variance: Floats, weight: Floats, x: Floats, P: Floats) -> None:
-    """Correct the state sequentially with all weighted measurements of finite variance."""
+    """Correct the state by all weighted measurements of finite variance, one after another."""
     codes, value = rows.code.stop, equations.value
     change, g, gain = np.zeros(len(x)), np.empty(len(x)), np.empty(len(x))
     T, z = np.empty((ix.MOTION, ix.MOTION)), np.empty(ix.MOTION)
@@ -320,7 +319,7 @@ def _project(equations: Equations, q: int, vector: Floats) -> float:
 
 @inlined
 def _add_quantity(equations: Equations, q: int, factor: float, P: Floats, mean: Floats, g: Floats) -> float:
-    """Add a multiple of ``P h`` to g, and return the same multiple of ``h' mean``, where h is row q of H."""
+    """Add ``factor P h`` to g, and return ``factor h' mean``, where h is row q of H."""
     total = 0.0
     for k in range(ix.TERMS):
         f = factor * equations.coefficient[q, k]
@@ -332,7 +331,7 @@ def _add_quantity(equations: Equations, q: int, factor: float, P: Floats, mean: 
 
 @inner
 def compute_log_evidence(rows: Rows, variance: Floats, found: Fit) -> float:
-    """Return the log evidence of the measurements of finite variance, by Laplace's method with Student's t."""
+    """Return the log evidence of the measurements of finite variance by Laplace's method, with Student's t errors."""
     usual, density = rows.degrees, 0.0
     for j in range(len(rows.variance)):
         own = rows.late_degrees if j < rows.code.stop and found.residual[j] > 0.0 else usual
@@ -342,9 +341,9 @@ def compute_log_evidence(rows: Rows, variance: Floats, found: Fit) -> float:
 
 @inner
 def mean_weights(rows: Rows, variance: Floats, weight: Floats) -> tuple[float, float]:
-    """Return the mean weight of codes that are not left out, and the mean weight of phases and Dopplers; NaN for none.
+    """Return the mean weight of codes that are not excluded, and the mean weight of phases and Dopplers.
 
-    Only measurements of finite variance are included.
+    Only measurements of finite variance are included. A mean weight without measurements is NaN.
     """
     code, motion, codes, motions = 0.0, 0.0, 0, 0
     for j in range(rows.doppler.stop):
@@ -358,9 +357,9 @@ def mean_weights(rows: Rows, variance: Floats, weight: Floats) -> tuple[float, f
 
 @inner
 def compute_evidence(rows: Rows, one: Correction) -> tuple[float, float]:
-    """Return the log evidence of all measurements except codes, and the log evidence of the codes given the others.
+    """Return the log evidence of all measurements except codes, and the log evidence of codes given all others.
 
-    An evidence is 0 if there are too few measurements, because these fit any speed and position.
+    An evidence is 0 with too few measurements, because these fit any speed and position.
     """
     joint = compute_log_evidence(rows, rows.variance, one.fit)
     without_codes, found = rows.variance.copy(), new_fit(rows)
@@ -377,7 +376,7 @@ def compute_evidence(rows: Rows, one: Correction) -> tuple[float, float]:
 
 @inner
 def refit_inflated_prior(rows: Rows, one: Correction) -> None:
-    """Fit again from initial weights for inflated position and speed variances, and keep the fit with more evidence."""
+    """Fit again with initial weights for an inflated prior (position, speed), and keep the fit with more evidence."""
     inflated, found = one.P_prior.copy(), new_fit(rows)
     inflated[ix.ARC, ix.ARC] += constants.FREEDOM_PLACE_M2
     inflated[ix.SPEED, ix.SPEED] += constants.FREEDOM_SPEED_M2PS2

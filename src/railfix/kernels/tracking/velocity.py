@@ -1,7 +1,7 @@
 """Antenna velocities without the line, from carrier-phase changes or Dopplers.
 
-Velocity and clock are fitted by least squares with Student's t errors, for a train on gradients of a few per cent at
-most. If the velocity points across the line, the position, the branch or the map is wrong.
+Velocity and clock drift are fitted by reweighted least squares (Student's t errors), with a vertical velocity near 0.
+If the velocity points across the line, the position, the branch or the map is wrong.
 """
 
 from __future__ import annotations
@@ -18,12 +18,11 @@ from railfix.kernels.tracking.equations import write_range_rate
 from railfix.kernels.tracking.layout import Records
 from railfix.kernels.tracking.update import correct, median
 
-#: Standard deviation of the vertical velocity [m/s].
+#: Assumed standard deviation of the vertical velocity [m/s], for gradients of a few per cent.
 CLIMB_MPS = 0.3
-#: Standard deviation of a loose prior of the velocity, and of the clock about the median, for conditioning [m/s].
+#: Standard deviation of the loose prior of velocity and clock drift [m/s], for conditioning.
 PRIOR_MPS = 1e3
-#: Degrees of freedom of the errors, rounds of reweighting, required redundancy, and smallest mean weight, below which
-#: the measurements do not agree with each other.
+#: Degrees of freedom of the errors, number of fits, required redundancy, and least mean weight of a consistent fit.
 DEGREES = 4.0
 PASSES = 8
 REDUNDANT = 2
@@ -32,11 +31,12 @@ AGREEING = 0.9
 
 @kernel
 def write_velocities(epoch: Records, channel: Records, near_ecef_m: Floats, up: Floats) -> None:
-    """Write velocities of epochs with covariances and ages; Dopplers are used where phases give no velocity.
+    """Write velocities, covariances and ages from phases, or from Dopplers where phases give no velocity.
 
-    The velocity is NaN where the measurements are too few or do not agree. A velocity from phases is valid half an
-    interval before the epoch. `epoch` (T,) and `channel` (T, K) are records `EPOCH` and `CHANNEL`. `near_ecef_m`, shape
-    (T, 3), is a position accurate to hundreds of metres, NaN if unknown; `up`, shape (T, 3), is the vertical there.
+    The velocity is NaN where the measurements are too few or inconsistent. A velocity from phases is valid half an
+    interval before the epoch. `epoch`, shape (T,), and `channel`, shape (T, K), are records `EPOCH` and `CHANNEL`.
+    `near_ecef_m`, shape (T, 3), are positions accurate to hundreds of metres, NaN if unknown. `up`, shape (T, 3), are
+    the vertical unit vectors at these positions.
     """
     epochs, channels = channel.shape
     h, y, r, u = np.empty((channels + 1, 4)), np.empty(channels + 1), np.empty(channels + 1), np.empty(3)
@@ -68,11 +68,11 @@ def write_velocities(epoch: Records, channel: Records, near_ecef_m: Floats, up: 
 
 @inner
 def fit_velocity(h: Floats, y: Floats, r: Floats, count: int, up: Floats, velocity: Floats, covariance: Floats) -> bool:
-    """Fit velocity and clock to measurements ``y = h . v + clock``; return whether they are sufficient and consistent.
+    """Fit velocity and clock drift; return False for too few or inconsistent measurements.
 
-    h, y, r, shapes (M, 4), (M,), (M,), are coefficients, values [m/s] and variances; the first `count` are used. The
-    median is subtracted from y, and a vertical velocity of 0 is appended. The results are written into `velocity`,
-    shape (3,), and `covariance`, shape (3, 3), which is scaled with the residuals.
+    The first `count` rows of h, shape (M, 4), y and r, shape (M,), are coefficients, range rates [m/s] and variances of
+    measurements ``y = h . v + drift``. y is changed, and a vertical velocity of 0 is appended. The results are written
+    into `velocity`, shape (3,), and `covariance`, shape (3, 3), which is scaled by the residuals.
     """
     if count - 3 < REDUNDANT:
         return False
