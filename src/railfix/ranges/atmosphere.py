@@ -32,7 +32,7 @@ def thin_shell_obliquity(elevation_deg: Floats) -> Floats:
 def vertical_delay_m(slant_m: Floats, elevation_deg: Floats, frequency_hz: Floats) -> Floats:
     """Return the median vertical delay on L1 over the channels, shape (T,) [m]; 0 where no channel has a delay.
 
-    `slant_m` and `elevation_deg` have shape (T, K), the carrier frequencies shape (K,).
+    `slant_m` and `elevation_deg` have shape (T, K); `frequency_hz` has shape (K,).
     """
     vertical = medians(slant_m / thin_shell_obliquity(elevation_deg) * (frequency_hz / FREQUENCY_L1) ** 2)
     return np.where(np.isfinite(vertical), vertical, 0.0)

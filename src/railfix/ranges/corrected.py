@@ -107,7 +107,7 @@ class SatelliteRanges(NamedTuple):
 
     source: SourceSatellites
     correction_m: Floats  #: Satellite clock minus group delay, to be added to the codes; shape (T, K).
-    reason: Bits  #: Rejection reasons (`reasons.Reason` bits) of codes, records and corrections, shape (T, K).
+    reason: Bits  #: Rejection reasons (`reasons.Reason` bits), 0 if usable; shape (T, K).
 
     @property
     def states(self) -> SatelliteStates:

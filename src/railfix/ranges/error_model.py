@@ -173,7 +173,7 @@ class ErrorModel:
     def at(
         self, elevation_deg: ArrayLike, relative_azimuth_deg: ArrayLike, cn0_dbhz: ArrayLike
     ) -> tuple[Floats, Floats]:
-        """Return the overbounding sigma and bias of observations, broadcast to one shape [m].
+        """Return the overbounding sigma and bias of observations [m]; the arguments are broadcast to one shape.
 
         Sigma and bias are NaN where the direction is unknown or the model has no value.
         """

@@ -227,7 +227,7 @@ def _sides_of_two(samples: ErrorSamples, which: Masks) -> int:
 
 
 def faulty_stretches(samples: ErrorSamples) -> tuple[tuple[float, float], ...]:
-    """Return stretches of the line, chainages from and to [m], with more frequent local faults than the whole line.
+    """Return start and end chainages [m] of stretches with more frequent local faults than the line as a whole.
 
     A stretch is reported if the lower limit (Clopper and Pearson, one-sided) of the fraction of faulty blocks on the
     stretch exceeds the upper limit of this fraction on the whole line; neighbouring stretches are joined. The prior of

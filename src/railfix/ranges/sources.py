@@ -68,7 +68,7 @@ class CorrectionSource(Protocol):
     def satellites(
         self, time: Datetimes, channels: Channels, code_m: Floats, *, max_age_s: float | None = None
     ) -> SourceSatellites:
-        """Return the satellites at the transmission times of the codes, shape (T, K) [m]."""
+        """Return the satellites at the transmission times of the codes `code_m`, shape (T, K)."""
 
     def delays(self, time: Datetimes, channels: Channels, satellites: SourceSatellites, seen: SeenFrom) -> SourceDelays:
         """Return the signal delays at approximate antenna positions."""

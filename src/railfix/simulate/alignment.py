@@ -33,7 +33,8 @@ _SEMI_MAJOR_M: Final = 6_378_137.0
 _FLATTENING: Final = 1.0 / 298.257_223_563
 #: Spacing of the points at which the curve is integrated [m]; the spline between the points is exact to 1e-6 m.
 _STEP_M: Final = 0.5
-_ROUNDS: Final = 8  #: Number of rounds of the integration; each round multiplies the error by (length / Earth radius).
+#: Number of rounds of the integration; each round multiplies the error by (line length / Earth radius).
+_ROUNDS: Final = 8
 
 #: Elements of the simulated test line: length [m]; radius at the end of the element (right positive) [m]; cant at the
 #: end of the element [m].
@@ -138,9 +139,7 @@ class Alignment(Knots):
         return np.stack([offset.at(chainage_m) for offset in offsets], axis=-1)
 
     def track(self) -> Track:
-        """Return the track map: the points of the curve at `point_chainage_m`, displaced by the map error, and their
-        attributes.
-        """
+        """Return the track map: the points at `point_chainage_m` with their attributes, displaced by the map error."""
         chainage = self.point_chainage_m()
         ecef = self.at(chainage)
         exact = not (self.settings.map_error.plan_sigma_m or self.settings.map_error.height_sigma_m)
@@ -185,7 +184,7 @@ def build_alignment(settings: LineSettings) -> Alignment:
 
 
 def _pattern_knots(length_m: float) -> Knots:
-    """Return the knots of the simulated test line: `PATTERN` is repeated up to a length, with every second copy
+    """Return the knots of the simulated test line: `PATTERN` is repeated up to `length_m`, with every second copy
     mirrored.
     """
     repeats = int(np.ceil(length_m / PATTERN_LENGTH_M - 1e-12))
@@ -226,7 +225,7 @@ def _integrate(line: Alignment) -> tuple[Floats, Floats]:
     lat0, lon0 = np.radians([settings.latitude_deg, settings.longitude_deg])
 
     def total(rate: Floats) -> tuple[Floats, Floats]:
-        """Integrate a rate given at the Gauss points; return the integrals at the edges and at the Gauss points."""
+        """Return the integrals, at interval edges and at Gauss points, of a rate with values at the Gauss points."""
         at_edges = np.concatenate([[0.0], np.cumsum(rate.mean(axis=1) * step)])
         slope = (rate[:, 1] - rate[:, 0]) / (offset[1] - offset[0])
         start = rate[:, 0] - slope * offset[0]

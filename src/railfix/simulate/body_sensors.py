@@ -177,7 +177,7 @@ def slip_table(simulation: Simulation, settings: TachometerSettings) -> pl.DataF
     return pl.DataFrame({"time_gpst": start, "end_gpst": end, "ratio": ratio})
 
 
-_HALF_S: Final = 0.02  #: Upper limit of half the time interval over which differences are formed [s].
+_HALF_S: Final = 0.02  #: Largest half-width of the interval over which differences are formed [s].
 _BLOCK: Final = 50_000  #: Number of samples computed in one step.
 #: Length of the lever arm from which the attitude is computed; with this length, rounding of positions is negligible
 #: [m].

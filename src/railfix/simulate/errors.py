@@ -111,7 +111,7 @@ class GaussMarkov(Interpolated):
 
 
 def _interpolate_sigma(rho: float) -> float:
-    """Return the root mean square between nodes of an interpolated process of standard deviation 1."""
+    """Return the RMS between nodes of an interpolated process whose standard deviation at the nodes is 1."""
     u = (np.arange(200) + 0.5) / 200.0
     weight = 0.5 * np.stack(
         [-u + 2 * u**2 - u**3, 2 - 5 * u**2 + 3 * u**3, u + 4 * u**2 - 3 * u**3, -(u**2) + u**3], axis=-1
@@ -208,9 +208,9 @@ class CommonErrors:
         return any((*atmosphere, self._settings.troposphere.zenith_sigma_m, self._clocks, self._orbits))
 
     def _of_satellites(self, stream: int, sigma: str, time: str) -> list[tuple[list[int], GaussMarkov]]:
-        """Return, for each constellation, the columns of the constellation's satellites and the process of an error.
+        """Return, for each constellation, the columns of the constellation's satellites and the process of one error.
 
-        `sigma` and `time` are the names of the settings; constellations with a sigma of 0 are left out.
+        `sigma` and `time` are the names of the error's settings; constellations with a sigma of 0 are left out.
         """
         found = []
         for letter, table in sorted(self._settings.satellites.items()):

@@ -65,7 +65,7 @@ class Element(ScenarioSettings):
 class Gradient(ScenarioSettings):
     """Gradient of the line from a chainage to the next change of gradient."""
 
-    from_m: NotNegative  #: Chainage of the change of gradient, the middle of its vertical curve.
+    from_m: NotNegative  #: Chainage of the change of gradient, in the middle of the vertical curve.
     permille: float = Field(ge=-100.0, le=100.0)  #: Positive where the line rises with chainage.
     vertical_radius_m: Positive = 4000.0  #: Radius of the vertical curve from the previous gradient to this gradient.
 
@@ -75,7 +75,8 @@ class Terrain(ScenarioSettings):
 
     from_m: NotNegative = 0.0  #: Chainage at which this terrain begins.
     straight_m: Annotated[Between, at_least(1.0)] = (200.0, 1500.0)  #: Range of the lengths of straights.
-    curve_m: Annotated[Between, at_least(1.0)] = (100.0, 500.0)  #: Range of the lengths of curves without transitions.
+    #: Range of the lengths of curves, excluding their transitions.
+    curve_m: Annotated[Between, at_least(1.0)] = (100.0, 500.0)
     radius_m: Annotated[Between, at_least(100.0)] = (400.0, 1600.0)  #: Range of the radii.
     permille: float = Field(default=10.0, ge=0.0, le=35.0)  #: Largest gradient.
     #: Range of the distance between two changes of gradient.
@@ -86,7 +87,7 @@ class GeneratedLine(ScenarioSettings):
     """Commercial line generated at random."""
 
     seed: Seed = 1  #: Seed of the line, separate from the seed of the run, so that several runs can share a line.
-    #: Speed for which the cant of a curve is the equilibrium cant, limited to `largest_cant_m` and rounded to 5 mm.
+    #: Speed of the equilibrium cant. The cant is limited to `largest_cant_m` and rounded to 5 mm.
     speed_mps: Positive = 110.0 / 3.6
 
     largest_cant_m: NotNegative = 0.105
@@ -150,7 +151,7 @@ class LineSettings(ScenarioSettings):
     elements: tuple[Element, ...] = ()
     gradients: tuple[Gradient, ...] = ()  #: Gradients by rising chainage; without gradients, the line is level.
     #: Length of the line. The pattern of 756 m is repeated up to this length, with every second copy mirrored. With
-    #: `elements`, this is the sum of their lengths; for a file, `length_m` must be NaN.
+    #: `elements`, the length is the sum of the element lengths; for a file, `length_m` must be NaN.
     length_m: float = Field(default_factory=_length_m, allow_inf_nan=True)
 
     generated: GeneratedLine = GeneratedLine()
@@ -222,7 +223,7 @@ def knots_of_elements(elements: Sequence[Element], gradients: Sequence[Gradient]
 
 
 def _vertical(gradients: Sequence[Gradient], length_m: float) -> tuple[Floats, Floats]:
-    """Return the chainages and gradients of the ends of the vertical curves, between which the gradient is linear.
+    """Return the chainages of the ends of the vertical curves, and the gradients at these ends.
 
     Raise SettingsError if a vertical curve overlaps another or an end of the line.
     """
@@ -284,7 +285,7 @@ def _plan(settings: LineSettings, rng: np.random.Generator) -> list[Element]:
 
 
 def _cut(elements: list[Element], length_m: float) -> list[Element]:
-    """Return the elements up to a length; a straight replaces the last curve and its transitions if they do not fit."""
+    """Return the elements up to a length; a straight replaces a last curve that does not fit, and its transitions."""
     while elements and sum(item.length_m for item in elements) > length_m:
         # Straight, transition, curve, transition: all four are replaced.
         del elements[-4:]
@@ -367,7 +368,7 @@ def line_of_file(settings: LineFile) -> FileLine:
 
 
 def _arc_length(chord: CubicSpline[np.float64], knots: Floats) -> tuple[Floats, Floats]:
-    """Return parameters of the spline about every half metre, including the knots, and their arc lengths.
+    """Return spline parameters every half metre or so, including the knots, and the arc length at each parameter.
 
     The arc length is integrated by three-point Gauss quadrature.
     """

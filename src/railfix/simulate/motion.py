@@ -1,7 +1,7 @@
 """Chainage and speed of the train over time, and true positions of its antennas.
 
-The motion is a shuttle between two points, or a run curve: stops at stations, and between these the highest speed that
-line, curves and train permit. Antennas are on a rigid body with both bogie centres on the continuous line; their
+The motion is a shuttle between two points, or a run curve: stops at stations, and the highest speed that line, curves
+and train permit between stops. Antennas are on a rigid body with both bogie centres on the continuous line; their
 positions are computed by Newton's method and Rodrigues' rotation, independently of `railfix.track.vehicle`.
 """
 
@@ -112,7 +112,7 @@ _RAIL_HEAD_M: Final = 0.070  #: Distance between the contact points of a wheelse
 
 
 def build_motion(line: Alignment, scenario: Scenario, *, duration_s: float | None = None) -> Motion:
-    """Return the motion of the middle of the vehicle: a shuttle, or a run curve if settings of the run curve are given.
+    """Return the motion of the middle of the vehicle: a run curve if the scenario specifies one, otherwise a shuttle.
 
     The motion covers `duration_s`, by default the duration of the scenario; with a duration of 0, the motion ends at
     the last stop of the first leg. Raise SettingsError if the train does not fit on the line.
@@ -131,9 +131,7 @@ def build_motion(line: Alignment, scenario: Scenario, *, duration_s: float | Non
 
 
 def shuttle(first_m: float, last_m: float, duration_s: float, settings: RunSettings) -> Motion:
-    """Return the motion to and fro between two chainages for at least `duration_s`, with a standstill at both
-    chainages.
-    """
+    """Return the motion back and forth between two chainages for at least `duration_s`, with standstill at both."""
     length = last_m - first_m
     up, down = settings.acceleration_mps2, settings.deceleration_mps2
     top = min(settings.cruise_mps, float(np.sqrt(2.0 * length * up * down / (up + down))))
@@ -237,7 +235,7 @@ class AntennaTruth:
     """True positions of an antenna at n positions of the vehicle."""
 
     ecef_m: Floats  #: Position of the antenna, shape (n, 3).
-    #: Chainage of the centreline point in the plane through the antenna perpendicular to the line between the bogies,
+    #: Chainage of the centreline point abeam the antenna, in the plane perpendicular to the line between the bogies,
     #: shape (n,).
     chainage_m: Floats
     forward: Floats  #: Unit vector of the longitudinal axis of the body, shape (n, 3).

@@ -32,7 +32,7 @@ _SHORT = ("errors.", "environment.", "sensors.", "line.generated.", "line.map_er
 def run_readme(simulation: Simulation, files: dict[str, Path], command: str) -> str:
     """Return the text of the README of a run.
 
-    `files` are the paths by name that `write_run` returns. `command` is the command that created the files; it may be
+    `files` has the paths that `write_run` returns, by name. `command` is the command that created the files; it may be
     empty.
     """
     scenario = simulation.scenario
@@ -96,7 +96,7 @@ def _files(simulation: Simulation, files: dict[str, Path]) -> dict[str, str]:
 
 
 def _list_effects(scenario: Scenario) -> str:
-    """Return the sentences of the README on errors, multipath, sensors and SBAS that are or are not simulated."""
+    """Return README sentences that state which errors, multipath, sensors and SBAS are simulated."""
     usual = Scenario().errors
     names = list(type(usual).model_fields)
     errors = [name for name in names if getattr(scenario.errors, name) != getattr(usual, name)]
@@ -135,7 +135,7 @@ def _list_effects(scenario: Scenario) -> str:
 
 
 def _settings(scenario: Scenario) -> dict[str, Any]:
-    """Return the settings of a scenario by dotted name; of the groups `_SHORT`, only non-default settings."""
+    """Return the settings of a scenario by dotted name; groups in `_SHORT` include only non-default settings."""
     usual = Scenario(sensors=None).describe()
     table = {}
     for name, value in scenario.describe().items():

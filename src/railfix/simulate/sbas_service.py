@@ -90,8 +90,8 @@ def factors(second: int, indicator: Sequence[int], *, latency: int = 0) -> Bytes
 
 
 def parameters(second: int, **values: int) -> Bytes:
-    """Return a type 10 message, degradation parameters, with raw values by name (`DEGRADATION`); parameters not given
-    are 0.
+    """Return a type 10 message, degradation parameters, with raw values by name (`DEGRADATION`); other parameters are
+    0.
     """
     if unknown := values.keys() - DEGRADATION.keys():
         raise ValueError(f"type 10 has no field {min(unknown)}")
@@ -148,7 +148,7 @@ def grid_delay(
 
 #: Numbers per message: slots in types 2 to 5, satellites in type 25, and grid points in type 26.
 _FAST, _LONG_TERM, _DELAYS = 13, 4, 15
-#: Number of slots in message type 24. This type replaces the last fast message if at most this many slots remain.
+#: Number of slots in message type 24. It replaces the last fast message if at most this many slots remain.
 _MIXED: Final = 6
 #: Largest fast correction, orbit correction and grid delay that the fields can represent [m].
 _LARGEST_FAST_M, _LARGEST_ORBIT_M, _LARGEST_DELAY_M = 255.0, 31.875, 63.75

@@ -1,4 +1,4 @@
-"""Simulated SBAS messages, one per second, and the file with these messages; messages of dual-frequency SBAS on L5."""
+"""Simulated SBAS messages, one per second, and the file with these messages; contents of the messages on L5."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def message(kind: int, second: int, *fields: Field) -> Bytes:
 
 
 def mask(second: int, slots: Collection[int], iodm: int = 0) -> Bytes:
-    """Return a type 31 message, the satellite mask, for satellites given by their slots."""
+    """Return a type 31 message, the satellite mask, with the satellites of the given slots."""
     return message(31, second, *((int(slot in slots), 1) for slot in range(1, 215)), (iodm, 2))
 
 
@@ -180,11 +180,12 @@ LOST: Final = 53  #: Stream of random numbers: lost messages.
 def sbas_messages(simulation: Simulation, settings: SbasSettings) -> SbasMessages:
     """Return the SBAS messages of a run, one per second, from `lead_s` before the start to the end of the run.
 
-    On L1, the fast corrections of all satellites (types 2 to 5, 24) are sent every 6 s; between them follow, in turn,
-    the masks, long-term corrections, grid delays, degradation and integrity. The corrections cancel the errors that
-    `Scenario.errors` adds to clocks, group delays, orbits and ionosphere of GPS, within the resolution of the messages
-    (0.125 m). On L5, integrity (types 35, 36) is sent every 6 s; between these messages follow, in turn, mask,
-    degradation and the corrections of GPS, Galileo and BeiDou. Messages are lost with the probability `lost_chance`.
+    On L1, the fast corrections of all satellites (types 2 to 5, 24) are sent every 6 s. Between these messages, the
+    masks, long-term corrections, grid delays, degradation and integrity are sent in turn. The corrections cancel the
+    errors that `Scenario.errors` adds to clocks, group delays, orbits and ionosphere of GPS, within the resolution of
+    the messages (0.125 m). On L5, integrity (types 35, 36) is sent every 6 s. Between these messages, mask, degradation
+    and the corrections of GPS, Galileo and BeiDou are sent in turn. Messages are lost with the probability
+    `lost_chance`.
     """
     service = (SimulatedDfmc if settings.band == "L5" else Service)(simulation, settings)
     scenario = simulation.scenario

@@ -83,7 +83,7 @@ class RunSettings(ScenarioSettings):
 
 
 class VehicleSettings(ScenarioSettings):
-    """Vehicle; antennas are given as (along, across to the right, above the rail tops) in metres.
+    """Vehicle; antenna positions are (along, across to the right, above the rail tops) in metres.
 
     The origin is midway between the bogie centres at the height of the rail tops; the front points in the direction of
     rising chainage. Cant is measured between the contact points of a wheelset, whose distance is the gauge plus 70 mm.
@@ -94,7 +94,7 @@ class VehicleSettings(ScenarioSettings):
     gauge_m: Positive = 1.067
     front: Three = (9.1, 0.25, 3.95)
     rear: Three = (-9.1, 0.25, 3.95)
-    length_m: Positive = 23.2  #: Overall length; the ends are equally far from the middle between the bogies.
+    length_m: Positive = 23.2  #: Overall length, centred on the middle between the bogies.
     #: Standard deviation of the random roll at 20 m/s and more; below this speed, proportional to the speed. The
     #: vehicle file does not contain this value, because it is unknown in practice.
     sway_sigma_deg: NotNegative = 0.0
@@ -161,7 +161,7 @@ class ReceiverSettings(ScenarioSettings):
     #: Increase of C/N0 from the horizon to the zenith, proportional to the sine of the elevation.
     cn0_rise_db: Finite = CN0_RISE_DB
     cn0_satellite_sigma_db: NotNegative = 0.0  #: Standard deviation of constant C/N0 differences between satellites.
-    clocks: Literal["separate", "common"] = "separate"  #: Hardware clock of the two receivers.
+    clocks: Literal["separate", "common"] = "separate"  #: Separate clocks of the two receivers, or one clock.
     #: Clock bias of the front receiver at the start; separate clocks of other receivers have fixed multiples of this
     #: bias.
     clock_bias_s: float = Field(default=1.2e-4, gt=-0.01, lt=0.01)

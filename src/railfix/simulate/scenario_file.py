@@ -1,7 +1,7 @@
 """Scenario files in TOML: the settings of `Scenario` for one run, or a recipe of several runs.
 
-With ``duration_s = "run"``, the run ends at the end of the last stop. A recipe names a base, which is another file in
-its folder or a shipped scenario, and the settings of each run that differ from the base::
+With ``duration_s = "run"``, the run ends at the end of the last stop. A recipe names a base scenario (another file in
+the same folder, or a shipped scenario), and the settings of each run that differ from the base::
 
     description = "two runs"
     base = "p1-commercial"

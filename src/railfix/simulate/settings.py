@@ -124,12 +124,12 @@ class SatelliteErrorSettings(ScenarioSettings):
     along_sigma_m: NotNegative = 0.0  #: Standard deviation of the along-track orbit error.
     cross_sigma_m: NotNegative = 0.0  #: Standard deviation of the cross-track orbit error.
     orbit_time_s: Positive = 7200.0  #: Correlation time of the orbit errors.
-    #: Standard deviation of the group-delay error, constant for each satellite and signal, which affects only codes.
+    #: Standard deviation of the group-delay error, a constant of each satellite and signal that affects only codes.
     group_delay_sigma_m: NotNegative = 0.0
 
 
 class IonosphereErrorSettings(ScenarioSettings):
-    """Ionospheric delay on L1 in addition to the model times `SkySettings.ionosphere_scale`."""
+    """Ionospheric delay on L1 in addition to `SkySettings.ionosphere_scale` times the model delay."""
 
     #: Standard deviation of the Gauss-Markov vertical delay at the first point of the line.
     vertical_sigma_m: NotNegative = 0.0
@@ -140,7 +140,7 @@ class IonosphereErrorSettings(ScenarioSettings):
 
 
 class TroposphereErrorSettings(ScenarioSettings):
-    """Tropospheric delay in addition to the model times `SkySettings.troposphere_scale`."""
+    """Tropospheric delay in addition to `SkySettings.troposphere_scale` times the model delay."""
 
     zenith_sigma_m: NotNegative = 0.0  #: Standard deviation of the Gauss-Markov zenith delay.
     zenith_time_s: Positive = 7200.0  #: Correlation time of the zenith delay.
@@ -175,13 +175,13 @@ class NoiseSettings(ScenarioSettings):
     """Time-correlated receiver noise; the standard deviations are in `ReceiverSettings`."""
 
     code_correlated_share: Share = 0.0  #: Fraction of the code-noise variance that is correlated in time.
-    #: Correlation time of the code noise: 1 / (4 B) for a code loop of noise bandwidth B, 1 s at 0.25 Hz.
+    #: Correlation time of the code noise. For a code loop of noise bandwidth B it is 1 / (4 B), or 1 s at 0.25 Hz.
     code_correlation_time_s: Positive = 1.0
     #: Standard deviation of the Gauss-Markov variation of C/N0, independent for each channel.
     cn0_wander_sigma_db: NotNegative = 0.0
     cn0_wander_time_s: Positive = 10.0  #: Correlation time of the C/N0 variation.
-    #: Observables whose noise depends on C/N0: only codes, or also phase and Doppler. If C/N0 is 20 dB lower, their
-    #: noise is 10 times as large; the sigmas of `ReceiverSettings` refer to 45 dB-Hz.
+    #: Observables whose noise depends on C/N0: only codes, or also phase and Doppler. If C/N0 is 20 dB lower, the noise
+    #: of these observables is 10 times as large; the sigmas of `ReceiverSettings` refer to 45 dB-Hz.
     weak_signals: Literal["code", "all"] = "code"
 
 
@@ -249,7 +249,7 @@ class TachometerSettings(ScenarioSettings):
     tooth_sigma: float = Field(default=0.0, ge=0.0, le=0.2)
     lost_chance: Share = 0.0  #: Probability that a pulse is not detected.
     doubled_chance: Share = 0.0  #: Probability that a pulse is followed by a second pulse before the next tooth.
-    slips: tuple[SlipInterval, ...] = ()  #: Given slips and slides, in order, without overlap.
+    slips: tuple[SlipInterval, ...] = ()  #: Specified slips and slides, in order of time.
     drawn_slips: DrawnSlips = DrawnSlips()
 
     @field_validator("slips")
@@ -319,7 +319,7 @@ class RadarSettings(ScenarioSettings):
     lowest_mps: NotNegative = 0.0  #: Lowest speed that is measured.
     highest_mps: Positive = 200.0 / 3.6  #: Highest speed that is measured.
 
-    dropouts: tuple[Dropout, ...] = ()  #: Given dropouts.
+    dropouts: tuple[Dropout, ...] = ()  #: Specified dropouts.
     dropouts_per_hour: NotNegative = 0.0  #: Mean number of random dropouts, with exponentially distributed intervals.
     dropout_duration_s: Positive = 5.0  #: Mean of the exponentially distributed durations of random dropouts.
 
@@ -371,12 +371,12 @@ class BaliseSettings(ScenarioSettings):
     """Balises and their reader on the vehicle."""
 
     balises: tuple[Balise, ...] = ()
-    #: Spacing of further balises from the beginning of the line, named B001, B002 and so on; 0 for none.
+    #: Spacing of additional balises along the line, named B001, B002 and so on; 0 for no additional balises.
     spacing_m: NotNegative = 0.0
     along_m: Finite = 0.0  #: Position of the reader in the body along the forward axis, as for the antennas.
     noise_sigma_m: NotNegative = 0.0  #: Standard deviation of the error of a reading along the line.
     missed: tuple[str, ...] = ()  #: Names of balises that are not read.
-    wrong: dict[str, str] = Field(default_factory=dict)  #: Wrong identity that is read, by the name of the balise.
+    wrong: dict[str, str] = Field(default_factory=dict)  #: Wrong identities that are read, by balise name.
     missed_chance: Share = 0.0  #: Probability that a balise is never read.
     wrong_chance: Share = 0.0  #: Probability that a balise is always read with the identity of another balise.
 
@@ -406,7 +406,7 @@ class SbasSettings(ScenarioSettings):
     #: Largest difference in latitude and in longitude between a grid point in the mask and the start of the line.
     grid_radius_deg: Positive = 25.0
     alert_m: Positive = 10.0  #: Range error of a faulty satellite above which the satellite is set to "do not use".
-    alert_s: NotNegative = 6.0  #: Time from the fault to its "do not use" alert.
+    alert_s: NotNegative = 6.0  #: Time from the excess of `alert_m` to "do not use".
     lost_chance: Share = 0.0  #: Probability that a message is not received.
     #: Time by which the messages begin before the run, so that all corrections are available when the run starts.
     lead_s: NotNegative = 300.0

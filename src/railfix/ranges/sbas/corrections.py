@@ -47,7 +47,7 @@ def best_prn(messages: SbasMessages, limits: SbasLimits | None = None) -> tuple[
     """Return the PRN with the most usable fast corrections (the smallest such PRN), and a note on the choice.
 
     The choice depends on all messages of a log, and must be made before positioning begins. For live messages, the PRN
-    must therefore be given.
+    must therefore be specified.
     """
     limits, scores = limits or SbasLimits(), []
     for number in messages.prns:

@@ -188,7 +188,7 @@ def decode(messages: SbasMessages, kind: int) -> Decoded:
 
 
 def time_near(time_of_day_s: Floats, near: Datetimes) -> Datetimes:
-    """Return the instants with given times of day that are nearest to `near`; NaT where the time of day is NaN."""
+    """Return the instants nearest to `near` that have the given times of day; NaT where the time of day is NaN."""
     midnight = near.astype("datetime64[D]").astype("datetime64[ns]")
     offset = time_of_day_s - seconds(near - midnight)
     return np.asarray(near + timedelta(offset - SECONDS_PER_DAY * np.rint(offset / SECONDS_PER_DAY)), "datetime64[ns]")

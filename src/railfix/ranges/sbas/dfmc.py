@@ -7,9 +7,9 @@ from ranges of B1C and B2a, the group delays of B-CNAV1 must be subtracted. GLON
 corrections are for the signals L1OC and L3OC, which are not read.
 
 The standard was not available. Message layouts are taken from cssrlib (sbas.py), the least values of sigma and the
-degradation from MAAST (L5_decodeMT37.m, L5_decode_satcorr.m, after ED-259A), and the slots of the mask from both and
-from Wireshark (packet-sbas_l5.c). An hour of messages of SouthPAN and BDSBAS (`test_sbas_dfmc.py`) shows that the slot
-has 8 bits and the fraction of the rate 4 bits, as in cssrlib, and that the issue of data for BeiDou is the IODE of
+degradation from MAAST (L5_decodeMT37.m, L5_decode_satcorr.m, after ED-259A), and the slots of the mask from cssrlib,
+MAAST and Wireshark (packet-sbas_l5.c). An hour of messages of SouthPAN and BDSBAS (`test_sbas_dfmc.py`) shows that the
+slot has 8 bits and the fraction of the rate 4 bits, as in cssrlib, and that the issue of data for BeiDou is the IODE of
 B-CNAV1. BDSBAS corrects the clocks of BeiDou-3 by decimetres. Since group delays differ by metres, these corrections do
 not include group delays.
 
@@ -117,7 +117,7 @@ class DfmcCorrections:
     clock_m: Floats  #: Correction added to c times the broadcast clock, without group delays; shape (T, K).
     sigma_m: Floats  #: Sigma from the indicator and the scale, before covariance and degradation; shape (T, K).
     factor: Floats  #: Upper triangular factor of the covariance, shape (T, K, 4, 4).
-    growth_m: Floats  #: Degradation of the correction since the reception, shape (T, K).
+    growth_m: Floats  #: Degradation of the correction since its reception, shape (T, K).
     #: Constant added to the sigma factor computed from the covariance, shape (T, K).
     constant: Floats
 
@@ -191,7 +191,7 @@ class DfmcService:
             choice = messages.describe_choice(prn)
         notes = (*messages.notes, choice)
         if zeros := int(np.sum(messages.of(prn).type == 0)):
-            notes += (f"PRN {prn} sent {zeros} messages of type 0 (do not use for safety): each stopped it for 60 s",)
+            notes += (f"PRN {prn} sent {zeros} messages of type 0 (do not use for safety): each stopped SBAS for 60 s",)
         return cls(messages, prn=prn, notes=notes)
 
     def satellites(self, time: Datetimes, satellite: Strings, navigation: Navigation | None = None) -> DfmcCorrections:

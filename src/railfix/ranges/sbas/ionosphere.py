@@ -166,7 +166,7 @@ def look_up(
     time: Datetimes,
     points: int,
 ) -> NDArray[Answer]:
-    """Return `answer` at the four points and the time of each row, shape (M, ...).
+    """Return the result of `answer` for the four points and the time of each row, shape (M, ...).
 
     `answer` is called once for all rows of one span that have the same points.
     """
@@ -376,7 +376,7 @@ def _judge(
 def _weights(
     point: Integers, state: Integers, x: Floats, y: Floats, polar_weights: Floats, polar: Masks
 ) -> tuple[Floats, Masks]:
-    """Return corner weights (M, 4), and a mask (M,) of positions inside three or four good corners."""
+    """Return corner weights (M, 4), and a mask (M,) of positions with four good corners, or inside three."""
     good = state == IonosphereState.OK
     weights = np.where(polar[:, None], polar_weights, _square_weights(x, y))
     used = good.all(axis=1)

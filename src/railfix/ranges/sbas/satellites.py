@@ -163,7 +163,7 @@ def long_term_in_force(
     stop: Datetimes,
     navigation: Navigation | None,
 ) -> LongTermInForce:
-    """Find the newest long-term corrections that match a navigation record; SBAS satellites do not need any.
+    """Find the newest long-term corrections that match a navigation record; SBAS satellites need no such correction.
 
     `number`, shape (K,), are the numbers in the PRN mask. Without `navigation`, the newest correction is used
     unchecked.
@@ -259,7 +259,7 @@ def growth(
 def _long_term_growth(
     tables: SatelliteTables, limits: SbasLimits, time: Datetimes, long_row: Integers, row: Integers
 ) -> tuple[Floats, Masks]:
-    """Return the degradation of long-term corrections (A.4.5.1.3), and a mask of precision time-outs."""
+    """Return the long-term degradation (A.4.5.1.3), and a mask of corrections older than the precision time-out."""
     table, ten = tables.long_term, tables.degradation
     there = long_row >= 0
     since_reference = seconds(time - table["reference"][long_row])

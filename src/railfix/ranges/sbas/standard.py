@@ -142,7 +142,7 @@ class SatelliteCorrections(FrozenArrays):
     en_route_m: Floats
     inflated: Masks  #: True where degradation data are missing and sigma is sigma UDRE plus 8 m, shape (T, K).
     rss: Masks  #: True where the squares of the terms are summed (RSS_UDRE of type 10), shape (T, K).
-    covariance: Integers  #: Row of the covariance (type 28) in force, -1 if none is; shape (T, K).
+    covariance: Integers  #: Row of the covariance (type 28) in force, -1 if none is in force; shape (T, K).
 
     def take_satellites(self, which: Integers) -> SatelliteCorrections:
         """Return the corrections of the satellites with the indices `which`."""

@@ -76,7 +76,7 @@ class Series:
         return replace(self, columns={**self.columns, **columns})
 
     def newest(self, series: Integers | int, time: Datetimes) -> Integers:
-        """Return the newest row of each series at or before each instant; -1 if none, or older than `OLDEST_S`."""
+        """Return the newest row of each series at or before each instant; -1 for no row within `OLDEST_S`."""
         since = (time - GPS_EPOCH).astype("timedelta64[ns]").astype(np.int64) // _MS
         wanted_series, wanted_time = np.broadcast_arrays(series, np.clip(since, 0, _SPAN - 1))
         wanted = wanted_series * _SPAN + wanted_time
@@ -152,7 +152,7 @@ class MaskTable:
 
 
 class SatelliteTables:
-    """Tables of all messages of one GEO that concern satellites, by the number of the satellite in the PRN mask.
+    """Tables of all messages of one GEO that concern satellites, by PRN mask number.
 
     `fast` has fast corrections; the column `fresh` is the satellite's first row after its last unmonitored row. `udre`
     has the UDREI from fast corrections and type 6; `grows_from` is the reception time from which degradation and

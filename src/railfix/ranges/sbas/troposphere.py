@@ -22,7 +22,7 @@ _RTCA_MEAN: Final = np.array(
         [2.77, 3.15, 2.57, 1.81, 1.55],
     ]
 )
-#: Seasonal variations of the same quantities (table A-2).
+#: Seasonal variations of the quantities in `_RTCA_MEAN` (table A-2).
 _RTCA_SEASON: Final = np.array(
     [
         [0.0, -3.75, -2.25, -1.75, -0.50],
@@ -52,8 +52,8 @@ def rtca_troposphere_sigma_m(elevation_deg: Floats) -> Floats:
 def rtca_troposphere_m(time: Datetimes, latitude_deg: Floats, height_m: Floats, elevation_deg: Floats) -> Floats:
     """Return the tropospheric slant delay of RTCA DO-229D (A.4.2.4) from latitude and day of year, shape (T, K) [m].
 
-    The model is for heights above mean sea level; an ellipsoidal height changes the delay by 1 mm per 3 m of
-    difference. The delay is NaN below 2 degrees, and at heights outside -100 m to 10 km.
+    The model is for heights above mean sea level; with ellipsoidal heights, the delay changes by 1 mm per 3 m of geoid
+    height. The delay is NaN below 2 degrees, and at heights outside -100 m to 10 km.
     """
     year = time.astype("datetime64[Y]").astype("datetime64[ns]")
     day = (time - year) / np.timedelta64(1, "D") + 1.0

@@ -60,8 +60,8 @@ def track_paths(
     first, first_rate, anchor = extra_m[main, column], rate_mps[main, column], field[main, column]
     size = np.maximum(strength[main, column], 1e-9)
     delay, rate = extra_m - first, rate_mps - first_rate
-    # Amplitudes relative to the main path: c = (a + jb) exp(-j 2 pi delay / wavelength).
-    # Single precision suffices from here: 1e-7 of a chip or of a wavelength.
+    # Amplitudes relative to the main path: c = (a + jb) exp(-j 2 pi delay / wavelength). From here on, single precision
+    # suffices; its error is 1e-7 of a chip or of a wavelength.
     turn = np.asarray(np.remainder(delay / wavelength_m, 1.0) * (2.0 * np.pi), dtype=np.float32)
     cosine, sine = np.cos(turn), np.sin(turn)
     a = np.asarray((field.real * anchor.real + field.imag * anchor.imag) / size**2, dtype=np.float32)
@@ -104,7 +104,7 @@ def _triangle(x: Singles) -> Singles:
 
 
 def _zero(real: Singles, imaginary: Singles, late: Singles, follow: Singles, spacing: float) -> Singles:
-    """Return the zero of the discriminator [chips] relative to the main path, which has amplitude 1 and `late` 0."""
+    """Return the zero of the discriminator [chips] relative to the main path (amplitude 1, `late` 0)."""
     half = 0.5 * spacing
     error = np.zeros(real.shape[1], dtype=np.float32)
     own = (1.0 - follow) * (real**2 + imaginary**2)
@@ -129,7 +129,7 @@ CLEAR_V: Final = -0.78  #: Fresnel parameter below which the loss of a knife edg
 
 
 def per_metre(distance_m: Floats, wavelength_m: Floats) -> Floats:
-    """Return the ratio of Fresnel parameter to clearance [1/m] for an edge at a distance and a source at infinity.
+    """Return the ratio of Fresnel parameter to clearance [1/m] for an edge at `distance_m` and a source at infinity.
 
     The formula is from ITU-R P.526-15, 4.1.
     """

@@ -115,7 +115,7 @@ class Electrification:
         self.settings = settings
 
     def _number(self, chainage_m: Floats, every: int) -> Floats:
-        """Return the chainage of the nearest mast; only every n-th mast is considered, with n given by `every`."""
+        """Return the chainage of the nearest mast; only each `every`-th mast counts."""
         spacing = self.settings.spacing_m * every
         return self.settings.first_m + spacing * np.rint((chainage_m - self.settings.first_m) / spacing)
 

@@ -10,8 +10,8 @@ In a scenario file::
     to_m = 900.0
     kind = "urban"
 
-Instead of sections, ``[environment.shares]`` gives the fraction of the line for each kind of section; the sections are
-then drawn at random.
+Instead of sections, ``[environment.shares]`` specifies the fraction of the line for each kind of section; the sections
+are then drawn at random.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class ElectrificationSettings(ScenarioSettings):
     lateral_m: Positive = 3.0  #: Distance of the axis of a mast from the track axis.
     width_m: Positive = 0.35  #: Width of a mast.
     height_m: Positive = 9.0  #: Height of the top of a mast above the rails.
-    beam_every: int = Field(default=1, ge=0)  #: Number n if every n-th mast has a beam; 0 for no beams.
+    beam_every: int = Field(default=1, ge=0)  #: Beams: 1 at every mast, 2 at every second mast, and so on; 0 for none.
     beam_height_m: Positive = 7.5  #: Height of the middle of a beam above the rails.
     beam_depth_m: Positive = 0.4  #: Depth of a beam.
     wire_height_m: Positive = 5.1  #: Height of the contact wire above the rails, over the track axis.
@@ -62,14 +62,14 @@ class ElectrificationSettings(ScenarioSettings):
 
 
 class RowSettings(ScenarioSettings):
-    """Row of vertical walls along the line (buildings, slopes, mountains), with uniformly distributed properties."""
+    """Row of walls along the line (buildings, slopes, mountains); pairs are ranges of uniform distributions."""
 
     sides: Sides = "both"
     distance_m: Between = (10.0, 30.0)  #: Distance of the wall from the track axis.
     height_m: Between = (6.0, 15.0)  #: Height of the top above the rails.
     length_m: Between = (10.0, 30.0)  #: Length along the line.
     gap_m: Between = (2.0, 10.0)  #: Gap to the next wall.
-    share: Share = 1.0  #: Fraction of the plots that have a wall.
+    share: Share = 1.0  #: Fraction of the building plots that have a wall.
     #: Amplitude reflection coefficient, from 0 to 1. Without `AntennaSettings`, it includes the effect of polarisation.
     reflection: Between = (0.2, 0.7)
     roughness_m: Between = (0.0, 0.02)  #: Standard deviation of the surface height.
@@ -129,7 +129,7 @@ class CorrelatorSettings(ScenarioSettings):
 
 
 class AntennaSettings(ScenarioSettings):
-    """Polarisation of the antenna and material of the walls; both effects multiply the `reflection` of a wall."""
+    """Polarisation of the antenna and permittivity of the walls, as amplitude factors of a wall's `reflection`."""
 
     cross_polar_zenith_db: NotNegative = 15.0  #: Loss of left-handed relative to right-handed signals at the zenith.
     cross_polar_horizon_db: NotNegative = 4.0  #: Loss of left-handed relative to right-handed signals at the horizon.
@@ -140,7 +140,7 @@ class AntennaSettings(ScenarioSettings):
 
 
 class SideStreetSettings(ScenarioSettings):
-    """Side streets with walls perpendicular to the line, with uniformly distributed properties."""
+    """Side streets with walls perpendicular to the line; pairs are ranges of uniform distributions."""
 
     spacing_m: Between = (50.0, 150.0)  #: Distance from the end of a street to the next street.
     width_m: Between = (8.0, 25.0)  #: Distance between the walls of a street.
@@ -154,7 +154,7 @@ class SideStreetSettings(ScenarioSettings):
 
 
 class TreeSettings(ScenarioSettings):
-    """Row of trees along the line, with uniformly distributed properties."""
+    """Row of trees along the line; pairs are ranges of uniform distributions."""
 
     sides: Sides = "both"
     distance_m: Between = (6.0, 12.0)  #: Distance of the trunks from the track axis.
@@ -183,9 +183,9 @@ class NeighbourSettings(ScenarioSettings):
 class RoofEquipment(ScenarioSettings):
     """Equipment on the roof of the vehicle near the antenna, such as air conditioning or a pantograph."""
 
-    ahead_m: Finite  #: Distance of the nearest edge in front of the antenna, negative behind the antenna.
+    ahead_m: Finite  #: Distance forward from the antenna to the nearest edge; negative if the edge is behind.
     above_antenna_m: Positive  #: Height of the top above the antenna.
-    half_width_m: Positive = 1.0  #: Half the width across the vehicle.
+    half_width_m: Positive = 1.0  #: Half the width of the equipment, across the vehicle.
 
 
 class EnvironmentSettings(ScenarioSettings):
@@ -193,7 +193,7 @@ class EnvironmentSettings(ScenarioSettings):
 
     electrification: ElectrificationSettings | None = None
     sections: tuple[SectionSettings, ...] = ()  #: Sections by rising chainage; between sections, the line is open.
-    #: Fraction of the length of the line by kind of section, instead of `sections`, which are then drawn at random.
+    #: Fraction of the line length by kind of section, instead of `sections`; the sections are then drawn at random.
     shares: dict[Kind, Share] = Field(default_factory=dict)
     section_length_m: Annotated[Between, at_least(20.0)] = (150.0, 800.0)  #: Range of the lengths of drawn sections.
     antenna_height_m: Positive = 4.0  #: Height of the antennas above the rails.

@@ -116,7 +116,7 @@ class Strips:
     value: dict[str, Floats]  #: Properties by name, each of shape (n,).
 
     def nearest(self, side: Indices, chainage_m: Floats) -> Indices:
-        """Return the index of the nearest structure on a side (0 left, 1 right), which has at least one structure."""
+        """Return the index of the nearest structure on a side (0 left, 1 right). No side may be empty."""
         low = np.clip(chainage_m, -0.25 * self.reach_m, 0.5 * self.reach_m)
         return np.searchsorted(self.border_m, side * self.reach_m + low, side="right") - 1
 

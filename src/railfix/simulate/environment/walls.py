@@ -42,7 +42,7 @@ class Rays(RowArrays):
 def _slants(across: Floats, z: Floats) -> tuple[Floats, Floats]:
     """Return the sines of the angles between rays and a horizontal edge, and between rays and a vertical edge.
 
-    `across` is the component of the unit vector perpendicular to the plane of both edges.
+    `across` is the component of the ray's unit vector perpendicular to the plane of the two edges.
     """
     size = np.abs(across)
     return size / np.sqrt(across**2 + z**2), size / np.sqrt(np.maximum(1.0 - z**2, 1e-9))
@@ -98,7 +98,7 @@ def shadow(row: Strips, rays: Rays, *, x0: Floats | float = 0.0, y0: Floats | fl
 class Reflections:
     """Reflections of N rays by one row of walls, shapes (N,)."""
 
-    amplitude: Floats  #: Amplitude; nearly 0 without a wall, or where the wall is too small.
+    amplitude: Floats  #: Amplitude of the reflection; nearly 0 where the wall is absent or too small.
     extra_m: Floats  #: Extra path compared with the direct signal.
     rate: Floats  #: Growth of the extra path with the chainage of the antenna [m/m].
     x_m: Floats  #: Coordinate x of the mirror image of the antenna, relative to the antenna.
@@ -173,7 +173,7 @@ def second_reflection(
 ) -> tuple[Floats, Floats, Floats]:
     """Return amplitude, extra path [m] and growth [m/m] of signals reflected by both sides in sequence, shapes (N,).
 
-    The extra path is ``2 (d_A + d_B) |u_y|`` with the distances d of the walls of the first row on both sides.
+    The extra path is ``2 (d_A + d_B) |u_y|`` with the distances d_A and d_B of the first row's walls on the two sides.
     """
     row = rows[0]
     side = (rays.y > 0.0).astype(np.intp)
