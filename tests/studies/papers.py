@@ -23,6 +23,7 @@ from p1_page import SINGLE, figures
 from railfix.cli import app
 
 TABLE: Final = paths.ROOT / "docs" / "papers.md"
+CHAPTER: Final = re.compile(r"^[\d.()]+(, [\d.()]+)*(?= )|^[\d.]+(?=, table)")
 DATA: Final[dict[str, Any]] = tomllib.loads(
     (paths.ROOT / "tests" / "references" / "papers.toml").read_text(encoding="utf-8")
 )
@@ -77,21 +78,23 @@ def document() -> str:
     lines = [
         "# The five papers, item by item",
         "",
-        "For each item of a paper, this page states the figure of the paper, the figure of railfix, the command that",
-        "provides the item (or Python alone, or a study of `tests/studies`), function and its test. An item without",
-        "a test is open. `python tests/studies/papers.py` writes the page from `tests/references/papers.toml`.",
+        "Each entry of this page is an item of a paper, with the number of its chapter. *Paper* is the value or the",
+        "rule in the paper, and *railfix* is the result of railfix. *Provided by* is a railfix command, Python alone,",
+        "or a study in `tests/studies`; the function is in brackets. An item without a test is open.",
+        "`python tests/studies/papers.py` writes this page from `tests/references/papers.toml`.",
     ]
     for paper, title in DATA["papers"].items():
         lines += ["", f"## {paper}: {title}", ""]
         for item in (item for item in DATA["item"] if item["paper"] == paper):
-            asked = f"; paper: {item['asked']}" if "asked" in item else ""
-            found = f"; railfix: {reached(item)}" if reached(item) else ""
-            test = f"`{item['test']}`" if "test" in item else "**open**"
-            lines.append(f"- {item['what']}{asked}{found}. By {item['by']}: `{item['where']}`; test {test}")
+            lines.append("- " + CHAPTER.sub(r"**\g<0>**", item["what"]))
+            lines += [f"  - Paper: {item['asked']}"] if "asked" in item else []
+            lines += [f"  - railfix: {reached(item)}"] if reached(item) else []
+            lines.append(f"  - Provided by: {item['by']} (`{item['where']}`)")
+            lines.append(f"  - Test: `{item['test']}`" if "test" in item else "  - Test: **open**")
     lines += ["", "## Where we read the papers differently", ""]
     for found in DATA["difference"]:
-        why = f" Why: {found['why']}." if found["why"] else ""
-        lines.append(f"- **{found['paper']}** {found['says']} Here: {found['here']}{why}")
+        why = [f"  - Reason: {found['why']}"] if found["why"] else []
+        lines += [f"- **{found['paper']}**", f"  - Paper: {found['says']}", f"  - railfix: {found['here']}", *why]
     return "\n".join(lines) + "\n"
 
 
@@ -102,40 +105,41 @@ def reached(item: dict[str, Any]) -> str:
 
 
 def _largest() -> str:
-    cells = [f"{name} {figures('corrected', 'all data', f'G       {name}, SBAS')[8]}" for name in SINGLE]
+    cells = [f"{name} {figures('corrected', 'all data', f'G       {name}, SBAS')[8]} m" for name in SINGLE]
     galileo = figures("commercial", "ways without tunnels", "G+J+E   p1 ")[8]
     filtered = [figures("filtered", "ways without tunnels", f"{systems:7s} filter ")[8] for systems in ("G+J", "G+J+E")]
     return (
-        f"{', '.join(cells)} m; without tunnels `p1` with Galileo {galileo} m, the filter along the track "
-        f"{filtered[0]} m (G+J) and {filtered[1]} m (G+J+E)"
+        f"{', '.join(cells)}; without tunnels, {galileo} m for `p1` with Galileo, and {filtered[0]} m (G+J) and "
+        f"{filtered[1]} m (G+J+E) for the filter along the track"
     )
 
 
 def _rate() -> str:
-    cells = [f"{name} {figures('corrected', 'ways without tunnels', f'G       {name}, SBAS')[0]}" for name in SINGLE]
-    return f"{', '.join(cells)} %"
+    cells = [f"{name} {figures('corrected', 'ways without tunnels', f'G       {name}, SBAS')[0]} %" for name in SINGLE]
+    return ", ".join(cells)
 
 
 def _table_4(*names: str) -> str:
     rows = [figures("test-line", "table 4", f"{name} ") for name in names]
-    rates, errors = (", ".join(row[0] for row in rows), ", ".join(f"{row[1]} / {row[2]}" for row in rows))
-    return f"{rates} %; {errors} m"
+    rates, errors = (" and ".join(row[0] for row in rows), " and ".join(f"{row[1]} / {row[2]} m" for row in rows))
+    return f"rate {rates} %; mean / standard deviation {errors}"
 
 
 def _figure_7() -> str:
     cells = figures("test-line", "figure 7", "all ")
-    return f"mean {cells[6]} m; conventional {cells[0]}, RTKLIB {cells[3]}"
+    return f"the mean error is {cells[6]} m; conventional positions {cells[0]} m, RTKLIB {cells[3]} m"
 
 
 def _seeds() -> str:
     under = {way: figures("seeds", "lines", f"G+J    {way} ")[-3:] for way in ("strict", "RTKLIB")}
-    return f"none over 10 m on {' '.join(under['strict'])} (`strict`, G+J); RTKLIB {under['RTKLIB'][0]}"
+    strict, rtklib = " ".join(under["strict"]), under["RTKLIB"][0]
+    return f"no error exceeds 10 m on {strict} lines (`strict`, G+J), and on {rtklib} lines with RTKLIB"
 
 
 def _p4() -> str:
     text = (paths.ROOT / "tests" / "references" / "results" / "p4-experiment.txt").read_text(encoding="utf-8")
     cells = next(line for line in text.splitlines() if line.startswith("ESBC, GPS       0.0")).split()
-    return f"p95 {cells[9]} and {cells[12]} m, least squares {cells[-2]} and {cells[-1]} m"
+    return f"p95 {cells[9]} m east and {cells[12]} m north; least squares {cells[-2]} and {cells[-1]} m"
 
 
 #: Figures that kept outputs hold.
