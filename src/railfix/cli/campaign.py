@@ -156,7 +156,7 @@ def open_executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executo
     if scheduler is None:
         with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_prepare_worker) as pool:
             try:
-                signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)  # workers inherit the mask until initialised
+                signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)  # workers then start with these signals blocked
                 for _ in range(workers):
                     pool.submit(int)
                 signal.pthread_sigmask(signal.SIG_UNBLOCK, _ENDING)

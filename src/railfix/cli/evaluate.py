@@ -110,9 +110,9 @@ def evaluate(
     The error is the distance along the line from the reference to the position, positive toward the end of the line in
     either direction of travel. The tables have three kinds of positions: the positions on the map, the positions with
     status ok, and the conventional positions (3-D single point, moved to the nearest point of the line). The statistics
-    are computed over the epochs of each kind, and over the epochs that all kinds have. Errors are grouped by antenna,
-    section, environment, speed, number of satellites used, presence of satellites, and status. With several runs, they
-    are also grouped by configuration and line.
+    are computed over all positions of each kind, and over the epochs with positions of all kinds. Errors are grouped by
+    antenna, section, environment, speed, number of satellites used, whether satellites were used, and status. With
+    several runs, they are also grouped by configuration and line.
 
     `evaluation.json` in DIR has all figures, the options and the hashes of the inputs; `errors.parquet` has one row per
     epoch and antenna. Further files are `tables.csv` and `intervals.csv`. For a run with protection levels,

@@ -79,7 +79,7 @@ def monitor(
 
     The single-point fixes of the three receivers are computed from the same satellites. Each fix must be within a
     circle around the receiver's known point, and the vectors between the fixes must agree with the vectors between the
-    points. The first cause that stops the trains is latched and printed.
+    points. The first cause for stopping the trains is latched and printed.
 
     Example: `railfix ground monitor a.rnx b.rnx c.rnx --nav day.nav --out monitor`
 

@@ -29,7 +29,7 @@ _SATELLITES: Final[Sequence[Column]] = (
     ("residual m", "residual_m", partial(digits, 2)), ("without it m", "without_shift_m", partial(digits, 2)),
     ("sigma then m", "without_sigma_m", partial(digits, 2)), ("outcome", "reason_text", str),
 )  # fmt: skip
-#: Parameter ``M_MMAP_THRESHOLD`` of ``malloc.h``, and its value: larger arrays [bytes] have memory of their own.
+#: Parameter ``M_MMAP_THRESHOLD`` of ``malloc.h``, and its value: larger arrays [bytes] are mapped separately.
 _THRESHOLD: Final = (-3, 1 << 17)
 
 

@@ -96,7 +96,7 @@ def compute_angles(line_ecef_m: Floats, axes: Floats) -> tuple[Floats, Floats]:
 def range_with_rotation(sat_ecef_m: ArrayLike, receiver_ecef_m: ArrayLike) -> tuple[Floats, Floats]:
     """Compute the geometric range with the Sagnac correction [m] and the line of sight, shapes (...) and (..., 3).
 
-    The satellite position `s` is in the Earth-fixed frame at transmission. To first order, rotating it into the frame
+    The satellite position `s` is in the Earth-fixed frame at transmission. To first order, rotating `s` into the frame
     at reception adds ``omega / c * (s_x r_y - s_y r_x)`` to the distance from the receiver position `r` (Sagnac;
     IS-GPS-200, 20.3.3.4.3.4). The neglected terms are below 0.2 mm. The line of sight `u` is the unit vector from
     receiver to satellite: d(range)/d(receiver) = -u; the gradient of the Sagnac term, at most 1.1e-5, is neglected.

@@ -396,7 +396,7 @@ def _with_limits(
 ) -> pl.DataFrame:
     """Return the table with additional columns of confidence limits, computed from the epochs `part`.
 
-    The limits are null without `part`, or if they are undefined.
+    The limits are null if there is no `part`, or if they are undefined.
     """
     schema = {"blocks": pl.Int64} | dict.fromkeys(LIMIT_COLUMNS, pl.Float64)
     if part is None:

@@ -338,7 +338,7 @@ def short_names(paths: Sequence[Path]) -> list[str]:
 
 
 def _figures(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
-    """Return the error statistics of all groupings of each run; with several runs also of each configuration."""
+    """Return the error statistics by grouping of each run and, if there are several runs, of each configuration."""
     epochs = epochs.select(*KEYS, *USED)
     groupings = ("all", "section", "environment", "speed", "satellites", "signals", "status")
     tables = [figures_by(_parts(epochs, "run", ()), groupings, options)]
@@ -360,7 +360,7 @@ def _parts(epochs: pl.DataFrame, by: str, as_one: Sequence[str]) -> Iterator[pl.
 
 
 def _intervals(epochs: pl.DataFrame) -> pl.DataFrame:
-    """Return the intervals of each run and antenna; with several runs also of each configuration and antenna."""
+    """Return the intervals by antenna of each run and, if there are several runs, of each configuration."""
     table = interval_table(epochs, list(KEYS))
     if epochs["run"].n_unique() < 2:
         return table

@@ -130,7 +130,7 @@ _OUTAGE_COLUMNS: Final = (
 def outage_table(epochs: pl.DataFrame) -> pl.DataFrame | None:
     """Return the stretches without satellites (`OUTAGE_COLUMNS`), with the errors of the filter, in order of time.
 
-    Stretches shorter than `LEAST_S` are omitted. Return None without a table of the filter.
+    Stretches shorter than `LEAST_S` are omitted. Return None if there is no table of the filter.
     """
     filtered = epochs.select(*KEYS, *_OUTAGE_COLUMNS).filter(OF_FILTER)
     if not len(filtered):
@@ -186,7 +186,7 @@ BRANCH_COLUMNS: Final[dict[str, str]] = {
 def branch_table(epochs: pl.DataFrame) -> pl.DataFrame | None:
     """Return the stated probability of the branch and the fraction of correct positions, by class of probability.
 
-    The table has `BRANCH_COLUMNS`. Return None without a table of the filter.
+    The table has `BRANCH_COLUMNS`. Return None if there is no table of the filter.
     """
     filtered = epochs.select(*KEYS, *_BRANCH_COLUMNS).filter(OF_FILTER)
     if not len(filtered):

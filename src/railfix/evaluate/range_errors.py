@@ -185,7 +185,7 @@ def range_errors(
     compensates for this; `share` is the weight of the range in the clock. An error common to all satellites is absorbed
     by the clock and does not affect the position. Without `base`, the satellite and atmospheric errors remain.
 
-    Raise MismatchError if fewer than two reference positions have a sigma within the limit.
+    Raise MismatchError if fewer than two reference positions have a sufficiently small sigma.
     """
     corrected = result.corrected
     good = ~(reference.sigma_m > _LARGEST_REFERENCE_SIGMA_M)

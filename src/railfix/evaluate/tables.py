@@ -360,8 +360,8 @@ def _beyond(found: Integrity, kind: str, worst: int) -> Table:
     return listing(f"above-level-{kind}", shown, columns, caption)
 
 
-#: Largest number of epochs listed in ``evaluation.json`` because their error exceeds the level, the largest excess
-#: first; the CSV file has all of them.
+#: Largest number of epochs with an error above the protection level that are listed in ``evaluation.json``, the largest
+#: excess first. The CSV file has all these epochs.
 MOST_BEYOND: Final = 200
 
 

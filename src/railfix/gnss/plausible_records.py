@@ -31,7 +31,7 @@ _ECCENTRICITIES: Final[Mapping[str, float]] = {"G": 0.05, "E": 0.2, "C": 0.05, "
 #: Limits of GLONASS radii, and of semi-major axes computed from position and velocity [m]. In the 2,104 records, these
 #: values are between 25,416 and 25,602 km.
 _GLONASS_M: Final = (25.3e6, 25.7e6)
-#: Largest difference of the reference times of orbit and clock of a record; they are equal in the 2,104 records.
+#: Largest plausible difference between toe and toc of a record; they are equal in the 2,104 records.
 LARGEST_TIME_DIFFERENCE_S: Final = 300.0
 _EARTH_GM: Final = 3.986004418e14  #: Geocentric gravitational constant [m^3/s^2].
 _NAMES: Final = {"G": "GPS", "E": "Galileo", "C": "BeiDou", "J": "QZSS", "R": "GLONASS"}

@@ -41,7 +41,7 @@ from railfix.reference.smoother import (
 from railfix.reference.wheel_distance import Wheel, estimate_wheel
 from railfix.track.trajectory import TRACK_AS_PATH, Trajectory
 
-#: Longest interval between two speeds across which the distance travelled counts as known [s].
+#: Longest interval between two speeds over which they are integrated to a distance [s].
 LONGEST_STEP_S: Final = 2.5
 #: Variance of the distance travelled in an interval longer than `LONGEST_STEP_S` [m2].
 UNKNOWN_M2: Final = 1e8

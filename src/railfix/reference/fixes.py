@@ -133,10 +133,10 @@ class Fixes:
     #: Distance between the antennas minus their distance on the vehicle; NaN where not checked; shape (n,).
     spacing_m: Floats
     arc_m: Floats  #: Arc length on the trajectory; NaN where not checked; shape (n,).
-    lateral_m: Floats  #: Offset from the trajectory to the right; NaN where not checked; shape (n,).
-    height_m: Floats  #: Offset from the trajectory upward; NaN where not checked; shape (n,).
+    lateral_m: Floats  #: Offset to the right of the trajectory; NaN where not checked; shape (n,).
+    height_m: Floats  #: Upward offset from the trajectory; NaN where not checked; shape (n,).
     sigma_m: Floats  #: Standard deviation along the track, shape (n,).
-    #: Distance from the previous good fix minus the distance travelled; NaN where no sensor measured it; shape (n,).
+    #: Distance from the previous good fix minus the distance travelled; NaN where it was not measured; shape (n,).
     travel_m: Floats
 
     def __len__(self) -> int:

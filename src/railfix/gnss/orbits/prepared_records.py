@@ -31,7 +31,7 @@ VALIDITY_S: Final[Mapping[str, float]] = {"G": 7200.0, "J": 7200.0, "E": 14_400.
 
 #: A transmission time outside the record's validity by more than this counts as wrong [s].
 _EARLY_S: Final = 3600.0
-#: Time span that a lookup key can hold [ms]: 34 years. Records of different years must have different keys.
+#: Time span that a lookup key can hold [ms]: 34 years, so that records of different years have different keys.
 _SPAN: Final = np.int64(2**40)
 _MILLISECOND: Final = np.timedelta64(1, "ms")
 
@@ -46,7 +46,7 @@ class Lookup:
     #: the record table; shape (n,).
     sent_key: Integers
     sent_record: Integers
-    #: Keys and rows with the start of use instead: half-way from the previous record's toe to the record's toe; (n,).
+    #: Keys of satellite and start of use (half-way from the previous record's toe to the record's toe), and rows; (n,).
     toe_key: Integers
     toe_record: Integers
 
@@ -56,10 +56,10 @@ class Lookup:
     available: Datetimes
 
     def find(self, number: Integers, time: Datetimes, limit: NDArray[np.timedelta64]) -> tuple[Integers, Masks, Masks]:
-        """Return each satellite's record at each time, whether it is valid, and whether it was sent later; (M, T).
+        """Return each satellite's record at each time, whether it is valid, and whether it was sent after the time.
 
-        The record is a row of the record table; -1 for a satellite without records. The record is valid if its toe
-        differs from the epoch by at most `limit`, which has one value per row of the table.
+        The shapes are (M, T). The record is a row number of the record table, or -1 for a satellite without records.
+        The record is valid if its toe differs from the epoch by at most `limit` (one value per row of the table).
         """
         shape = (len(number), len(time))
         if not len(self.sent_key):
@@ -169,8 +169,8 @@ def group_delay_s(records: KeplerRecords, signal: str, *, clock: ClockReference 
     QZSS     sigma (`ranges.second_codes.group_delay_sigma_m`), because LNAV has no ISC. CNAV and CNAV-2: TGD - ISC on
              L1 C/A, L2C, L5, L1C (IS-GPS-200, 30.3.3.3.1.1; IS-GPS-705, 20.3.3.3.1.2; IS-GPS-800, 3.5.3.9).
     Galileo  The clock of I/NAV refers to E1 and E5b, and the clock of F/NAV refers to E1 and E5a (OS SIS ICD 5.1.5).
-             E1 uses the BGD of the clock's pair. E5a and E5b use both BGDs; F/NAV has only BGD E5a/E1, which replaces
-             BGD E5b/E1. The delay on E6 is not broadcast (NaN).
+             The delay on E1 is the BGD of the clock's pair. E5a and E5b use both BGDs; F/NAV has only BGD E5a/E1, which
+             replaces BGD E5b/E1. The delay on E6 is not broadcast (NaN).
     BeiDou   The clock refers to B3I (B1I ICD 3.0, 5.2.4.10), on which the delay is 0. D1 and D2: TGD1 on B1I, TGD2 on
              B2I. CNV1 and CNV2: TGD_B1Cp and TGD_B2ap on the pilots, with ISC on the data signals (B1C and B2a ICD
              1.0, 7.6). CNV3: TGD_B2bI on B2b. On other signals, the delay is NaN.

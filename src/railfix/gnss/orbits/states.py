@@ -89,7 +89,7 @@ def satellite_states(
         NaN where not observed.
     navigation : Navigation
         If `precise` is set, positions and clocks are taken from the precise ephemeris; health and group delays are
-        taken from the nearest broadcast record of any age. A satellite that is absent from either has no record.
+        taken from the nearest broadcast record of any age. A satellite that one of the two lacks has no record.
     max_age_s : float, optional
         Limit on the time between epoch and toe, in addition to the validity of the records [s].
     record : ndarray of int, shape (T, M), optional
