@@ -71,13 +71,16 @@ def test_each_table_is_known_by_its_header_and_read_as_its_command_reads_it(desk
     paths["tachometer"].write_text("time_gpst,pulse\n,1\n")
     several = examine_files([*inputs, *(paths[name] for name in ("radar", "ranging", "balises", "tachometer"))])
     said = " ".join(several.problems)
-    for text in (
-        "has no time in common",
-        "also needs the ranging units",
-        "also needs the list of balises",
-        "time_gpst is empty",
-    ):
+    for text in ("no time in common", "needs the ranging units", "needs the list of balises", "time_gpst is empty"):
         assert text in said
+    models = [tmp_path / "support.toml", tmp_path / "curve.toml", desk / "scenario.toml", desk / "recipe.toml"]
+    support = "sigma_ura_m = 1.0, sigma_ure_m = 1.0, bias_m = 0.0, prior = 1e-5, constellation_prior = 1e-8"
+    models[0].write_text(f'format = "railfix integrity support 1"\nconstellation.G = {{ {support} }}\n')
+    models[1].write_text('format = "railfix C/N0 curve 0"\n')
+    found = examine_files([*inputs, *models])
+    assert [f.kind for f in found.findings[3:]] == ["integrity support message", "C/N0 curve", "scenario", "scenario"]
+    assert f"--set integrity_support={models[0]} --out" in found.command.replace("'", "")
+    assert "railfix cn0-curve" in "".join(found.problems)
     packed = tmp_path / "a.parquet"
     pl.DataFrame({"time_gpst": [np.datetime64(time)], "speed_mps": [1.0]}).write_parquet(packed)
     assert examine_files([packed]).findings[0].facts == ("1 reading (--radar)",)

@@ -25,6 +25,7 @@ from railfix.io.sp3 import read_sp3
 from railfix.pipeline.config import Config
 from railfix.ranges.sbas.files import read_sbas
 from railfix.run.checks import RECORD_REACH, Span, navigation_span, spans_apart
+from railfix.run.doctor_models import MODEL_KINDS, ModelKind, find_model_kind, model_options, read_model_facts
 from railfix.run.doctor_tables import PAIRS, TABLE_KINDS, TableKind, find_table_kind, read_table_facts, sensor_options
 from railfix.track.network_read import connect_network, is_route
 from railfix.track.quality import check_track, error_note
@@ -38,6 +39,7 @@ _MOST_NOTES: Final = 5  #: Maximum number of notes shown for one file.
 Kind = (
     Literal["observations", "navigation", "orbits", "sbas", "track", "vehicle", "settings", "positions", "unknown"]
     | TableKind
+    | ModelKind
 )
 
 
@@ -107,8 +109,7 @@ def _examine(path: Path, date: np.datetime64 | None) -> FileFinding:
     The file is read as each kind that its content suggests, until a reader accepts the file. If no reader accepts the
     file, the first error is returned as its problem.
     """
-    errors: list[str] = []
-    kinds = _find_kinds(path)
+    errors, kinds = list[str](), _find_kinds(path)
     for kind in kinds:
         try:
             return _DATED[kind](path, date) if kind in _DATED else _READERS[kind](path)
@@ -130,6 +131,8 @@ def _find_kinds(path: Path) -> tuple[Kind, ...]:
         return ("positions",) if has_times(path) else without
     if kind == "mate":
         return ("observations",) if mate_table(path) == "S_GNSS_SAT" else ("track",)
+    if kind == "toml" and (model := find_model_kind(path)) is not None:
+        return (model,)
     return _KINDS.get(kind, ("unknown",))
 
 
@@ -225,9 +228,7 @@ def _navigation(path: Path, date: np.datetime64 | None) -> FileFinding:
 
 def _track(path: Path) -> FileFinding:
     """Return the properties of a track map, which may be a route or a network, and may lack heights."""
-    options: tuple[str, ...] = ()
-    problems: tuple[str, ...] = ()
-    datum = ""
+    options, problems, datum = tuple[str, ...](), tuple[str, ...](), ""
     try:
         segments = read_segments(path, MapReading())
     except (InputFileError, SettingsError) as error:
@@ -310,6 +311,10 @@ def _table(path: Path, kind: TableKind) -> FileFinding:
     return FileFinding(path=path, kind=kind, facts=(phrase,), span=span)
 
 
+def _model(path: Path, kind: ModelKind) -> FileFinding:
+    return FileFinding(path=path, kind=kind, facts=(read_model_facts(path, kind),))
+
+
 def _orbits(path: Path) -> FileFinding:
     orbits = read_sp3(path)
     step = float(np.median(np.diff(orbits.time)) / _SECOND)
@@ -352,6 +357,7 @@ _READERS: Final[dict[Kind, Callable[[Path], FileFinding]]] = {
     "vehicle": _vehicle,
     "settings": _settings,
     **{kind: partial(_table, kind=kind) for kind in TABLE_KINDS},
+    **{kind: partial(_model, kind=kind) for kind in MODEL_KINDS},
 }
 
 
@@ -434,6 +440,8 @@ def _command(findings: Sequence[FileFinding], date: np.datetime64 | None) -> str
     }  # fmt: skip
     for kind, (option, most) in options.items():
         words += [word for finding in _filter(findings, kind)[:most] for word in (option, str(finding.path))]
+    readable = (finding for finding in findings if finding.facts)
+    words += model_options({finding.kind: finding.path for finding in readable if finding.kind in MODEL_KINDS})
     words += sensor_options({finding.kind: finding.path for finding in findings if finding.kind in TABLE_KINDS})
     heights = [str(finding.path) for finding in _filter(findings, "heights")] or ["log"]
     options_of_files = dict.fromkeys(word for finding in findings for word in finding.options)
