@@ -87,7 +87,7 @@ class GeneratedLine(ScenarioSettings):
     """Commercial line generated at random."""
 
     seed: Seed = 1  #: Seed of the line, separate from the seed of the run, so that several runs can share a line.
-    #: Speed of the equilibrium cant. The cant is limited to `largest_cant_m` and rounded to 5 mm.
+    #: Speed at which curves have the equilibrium cant. The cant is limited to `largest_cant_m` and rounded to 5 mm.
     speed_mps: Positive = 110.0 / 3.6
 
     largest_cant_m: NotNegative = 0.105
@@ -368,7 +368,7 @@ def line_of_file(settings: LineFile) -> FileLine:
 
 
 def _arc_length(chord: CubicSpline[np.float64], knots: Floats) -> tuple[Floats, Floats]:
-    """Return spline parameters every half metre or so, including the knots, and the arc length at each parameter.
+    """Return spline parameters at intervals of about 0.5 m, including the knots, and their arc lengths from the start.
 
     The arc length is integrated by three-point Gauss quadrature.
     """

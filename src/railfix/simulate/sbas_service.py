@@ -148,7 +148,7 @@ def grid_delay(
 
 #: Numbers per message: slots in types 2 to 5, satellites in type 25, and grid points in type 26.
 _FAST, _LONG_TERM, _DELAYS = 13, 4, 15
-#: Number of slots in message type 24. It replaces the last fast message if at most this many slots remain.
+#: Number of slots in message type 24. Type 24 replaces the last fast message if at most this many slots remain.
 _MIXED: Final = 6
 #: Largest fast correction, orbit correction and grid delay that the fields can represent [m].
 _LARGEST_FAST_M, _LARGEST_ORBIT_M, _LARGEST_DELAY_M = 255.0, 31.875, 63.75

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from railfix.simulate.signals import Simulation
 
 
-_BALISE_NOISE, _MISSED, _WRONG = 44, 45, 46  #: Random streams: reading error, missed reading, wrong identity.
+_BALISE_NOISE, _MISSED, _WRONG = 44, 45, 46  #: Streams of random numbers: reading error, missed, wrong identity.
 _STEP_S = 0.1  #: Spacing of the instants between which the passing of a balise is interpolated [s].
 
 

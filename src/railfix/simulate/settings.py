@@ -406,7 +406,7 @@ class SbasSettings(ScenarioSettings):
     #: Largest difference in latitude and in longitude between a grid point in the mask and the start of the line.
     grid_radius_deg: Positive = 25.0
     alert_m: Positive = 10.0  #: Range error of a faulty satellite above which the satellite is set to "do not use".
-    alert_s: NotNegative = 6.0  #: Time from the excess of `alert_m` to "do not use".
+    alert_s: NotNegative = 6.0  #: Time from the error exceeding `alert_m` to "do not use".
     lost_chance: Share = 0.0  #: Probability that a message is not received.
     #: Time by which the messages begin before the run, so that all corrections are available when the run starts.
     lead_s: NotNegative = 300.0

@@ -376,7 +376,7 @@ def _judge(
 def _weights(
     point: Integers, state: Integers, x: Floats, y: Floats, polar_weights: Floats, polar: Masks
 ) -> tuple[Floats, Masks]:
-    """Return corner weights (M, 4), and a mask (M,) of positions with four good corners, or inside three."""
+    """Return corner weights (M, 4), and a mask (M,) of positions within four good corners or a triangle of three."""
     good = state == IonosphereState.OK
     weights = np.where(polar[:, None], polar_weights, _square_weights(x, y))
     used = good.all(axis=1)

@@ -337,7 +337,7 @@ class ServiceTable:
 
 
 def _inside(values: Decoded, row: int, region: int, latitude_deg: Floats, longitude_deg: Floats) -> Masks:
-    """Return True for positions in a region: a rectangle, or half of a rectangle at (latitude 1, longitude 2)."""
+    """Return True for positions in a region: a rectangle, or its half that contains (latitude 1, longitude 2)."""
     north, west, south, east = (
         values[name][row, region] for name in ("latitude_1_deg", "longitude_1_deg", "latitude_2_deg", "longitude_2_deg")
     )

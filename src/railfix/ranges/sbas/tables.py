@@ -138,7 +138,7 @@ class MaskTable:
         return table.in_force(row, time, self._stops.last(time), self._limit)
 
     def holds(self, number: Integers, time: Datetimes) -> tuple[Masks, Masks]:
-        """Return True for epochs (T,) with an active PRN mask, and True for satellites (T, K) in this PRN mask."""
+        """Return masks of epochs (T,) with an active PRN mask, and of satellites (T, K) in this PRN mask."""
         row = self._by_time.newest(0, time)
         known = self._in_force(self._by_time, row, time)
         return known, self._by_time["member"][row][:, np.maximum(number, 0)] & known[:, None]
