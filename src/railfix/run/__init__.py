@@ -1,4 +1,4 @@
-"""Runs: reading of logs, positioning, writing of result folders, and reading of these folders."""
+"""Runs: reading of logs, positioning, and writing and reading of results folders."""
 
 import lazy_loader
 

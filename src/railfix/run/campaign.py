@@ -1,7 +1,7 @@
-"""Positioning of the logs of many runs by one command, which can be repeated to resume after an interruption.
+"""Positioning of the logs of many runs by one command. After an interruption, the same command resumes the work.
 
-Each run has a results folder named by the fields of the campaign, such as ``runs/train=A/day=2024-03-05``. The tables
-of all runs therefore form one hive-partitioned data set, which ``pl.scan_parquet(out / "runs/**/positions.parquet")``
+The results folder of a run is named by the campaign's fields, such as ``runs/train=A/day=2024-03-05``. The tables of
+all runs therefore form one hive-partitioned data set, which ``pl.scan_parquet(out / "runs/**/positions.parquet")``
 reads.
 """
 
@@ -36,15 +36,15 @@ _FIELD: Final = re.compile(r"\{(\w+)\}")
 
 
 class Campaign(Settings):
-    """Files of a campaign, given by patterns with fields in braces; paths are relative to the campaign file.
+    """Files of a campaign, specified by patterns with fields in braces. Paths are relative to the campaign file.
 
-    The files of a run are the files whose fields have the same values as the fields of the run's front log. For
-    example, ``nav/{day}.nav*`` selects the navigation files of the day of the run, and ``{line}/track.csv`` the track
-    of the line. A pattern without fields or ``*`` names one file that all runs use.
+    A run uses the files whose fields have the same values as the fields of its front log. For example,
+    ``nav/{day}.nav*`` selects the navigation files of the run's day, and ``{line}/track.csv`` the track of the run's
+    line. A pattern that has neither fields nor ``*`` names one file that all runs use.
     """
 
-    #: Pattern of the logs of the front antenna, such as ``logs/{train}/{day}/front.obs*``. Logs with the same values of
-    #: the fields are one run; several files of one antenna are joined in the order of their names.
+    #: Pattern of the logs of the front antenna, such as ``logs/{train}/{day}/front.obs*``. Logs whose fields have the
+    #: same values are one run; several files of one antenna are joined in the order of their names.
     front: str
     nav: str  #: Pattern of navigation files.
     track: tuple[str, ...]  #: Patterns of the files of the track, which are joined to a route in this order.
@@ -54,7 +54,7 @@ class Campaign(Settings):
     tachometer: str = ""  #: Pattern of the table of tachometer pulses; may be empty.
     inertial: str = ""  #: Pattern of the table of the inertial unit; may be empty.
     radar: str = ""  #: Pattern of the table of radar speeds; may be empty.
-    reference: str = ""  #: Pattern of the reference trajectory of a run, for the campaign's page; may be empty.
+    reference: str = ""  #: Pattern of the reference trajectory, for the campaign page; may be empty.
     config: Path | None = None  #: Settings file of all runs.
     options: RunOptions = RunOptions()  #: Options of all runs.
 
@@ -69,12 +69,12 @@ _ONE: Final = ("vehicle", "tachometer", "inertial", "radar", "reference")
 class CampaignRun:
     """One run of a campaign."""
 
-    fields: Mapping[str, str]  #: Value of each field, in the order in which the fields occur in the pattern `front`.
+    fields: Mapping[str, str]  #: Value of each field, in the order of the fields in the pattern `front`.
     inputs: RunInputs
     config: Config
     options: RunOptions
     out: Path  #: Results folder.
-    reference: Path | None = None  #: Reference trajectory; None if there is none.
+    reference: Path | None = None  #: File of the reference trajectory, or None.
 
     @property
     def done(self) -> bool:
@@ -92,18 +92,18 @@ class CampaignProgress(Protocol):
     """Callback for the progress of a campaign."""
 
     def __call__(self, *, done: int, kept: int, failed: int, total: int, left_s: float) -> None:
-        """Report the numbers of finished, kept, failed and all runs, and the time left [s].
+        """Report the numbers of finished, kept, failed and all runs, and the estimated remaining time [s].
 
         Kept runs have results from an earlier call; they are included in the finished runs.
         """
 
 
 def read_campaign(path: Path, out: Path) -> list[CampaignRun]:
-    """Read a campaign file, and return its runs with their input files and their results folders below `out`.
+    """Read a campaign file. Return its runs with their input files, and with their results folders below `out`.
 
-    Raise InputFileError if no log matches the pattern `front`. Raise SettingsError if a setting is misspelt, `front`
-    has no field, a pattern is invalid or has a field that `front` lacks, or a run has several files where one is
-    expected.
+    Raise InputFileError if no log matches the pattern `front`. Raise SettingsError if a setting is misspelt, if `front`
+    has no field, if a pattern is invalid or has a field that `front` lacks, or if several files of a run match a
+    pattern that may match only one.
     """
     campaign = load_settings(Campaign, path, what="a campaign file")
     folder, out = path.absolute().parent, out.absolute()
@@ -156,16 +156,15 @@ def run_campaign(
     progress: CampaignProgress | None = None,
     lost: tuple[type[Exception], ...] = (BrokenExecutor,),
 ) -> pl.DataFrame:
-    """Position all logs of a campaign file, write one row per run to ``campaign.csv``, and return this table.
+    """Position all logs of a campaign file. Write a table with one row per run to ``campaign.csv``, and return it.
 
-    Runs that already have results for the same inputs and settings are not repeated. A campaign that was interrupted is
-    continued by the same call. The columns are the fields, `status` ("done", "failed"), `error`, `epochs`,
-    `positioning_rate`, `ok_rate`, `wall_s`, `reference` and `folder` (below `out`); the row of a failed run has the
-    error message.
+    Runs that already have results for the same inputs and settings are not repeated, so the same call continues an
+    interrupted campaign. The columns of the table are the fields, `status` ("done", "failed"), `error` (message of a
+    failed run), `epochs`, `positioning_rate`, `ok_rate`, `wall_s`, `reference` and `folder` (below `out`).
 
-    `reading`, if it differs from the default, replaces the reading options of the campaign. `executor` has the
-    interface of `concurrent.futures`; its workers must have access to the same files. `lost` are the exceptions by
-    which the executor reports that a worker process has ended.
+    `reading`, if it differs from the default, replaces the reading options in the campaign file. `executor` is a
+    `concurrent.futures.Executor`; its workers must have access to the same files. `lost` are the exceptions by which
+    the executor reports that a worker process has ended.
     """
     runs = read_campaign(path, out)
     if reading not in (None, LogReading()):
@@ -181,7 +180,7 @@ def position_runs(
     progress: CampaignProgress | None = None,
     lost: tuple[type[Exception], ...] = (BrokenExecutor,),
 ) -> pl.DataFrame:
-    """Position runs whose results folders are below ``out / "runs"``; parameters and result as for `run_campaign`.
+    """Position runs whose results folders are below ``out / "runs"``. Other parameters and result: see `run_campaign`.
 
     Raise OutputError if `out` is not empty and not the folder of a campaign.
     """
@@ -210,7 +209,7 @@ def position_runs(
 
 
 def position_or_end(run: CampaignRun) -> tuple[dict[str, Any], bool]:
-    """Return the result of `position_run`; if the worker process is interrupted during the run, end the process.
+    """Return the result of `position_run`. If a worker process is interrupted during the run, end the process at once.
 
     The incomplete results of the run are removed before the process ends.
     """
@@ -224,13 +223,13 @@ def position_or_end(run: CampaignRun) -> tuple[dict[str, Any], bool]:
 
 
 def position_run(run: CampaignRun) -> tuple[dict[str, Any], bool]:
-    """Position a run unless its results exist; return its row of ``campaign.csv``, and whether its results existed."""
+    """Position a run unless its results exist. Return its row of ``campaign.csv``, and whether the results existed."""
     try:
         check_folder(run.out, overwrite="replace")
         if not (kept := run.done):
             options = run.options.replaced(overwrite="replace")
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore", RailfixWarning)  # the notes are in the record of the run
+                warnings.simplefilter("ignore", RailfixWarning)  # the notes are in the run's record
                 run_files(run.inputs, run.config, out=run.out, options=options)
         record = read_record(run.out).record
     except RailfixError as error:
@@ -247,9 +246,9 @@ def _row(run: CampaignRun, **values: Any) -> dict[str, Any]:
 
 
 def _find(folder: Path, pattern: str) -> list[tuple[Path, dict[str, str]]]:
-    """Return the files that match a pattern, in order of their names, each with the values of the fields.
+    """Return the files that match a pattern, each with the values of its fields, in order of their names.
 
-    A pattern without fields or ``*`` is returned even if there is no such file; the run then reports the error.
+    A pattern with neither fields nor ``*`` is returned even if there is no such file; the run then reports the error.
     """
     if not pattern:
         return []
@@ -270,7 +269,7 @@ def _find(folder: Path, pattern: str) -> list[tuple[Path, dict[str, str]]]:
 
 
 def _regex(part: str, seen: set[str]) -> str:
-    """Return the regular expression of a part of a pattern; a repeated field (in `seen`) must have the same value."""
+    """Return the regular expression for a part of a pattern. A field in `seen` must have its earlier value."""
     if part == "*":
         return "[^/]*"
     field = _FIELD.fullmatch(part)
@@ -282,7 +281,7 @@ def _regex(part: str, seen: set[str]) -> str:
 
 
 def _check_pattern(path: Path, name: str, pattern: str) -> None:
-    """Raise SettingsError if a pattern has adjacent fields, ``**``, or an invalid name of a field."""
+    """Raise SettingsError if a pattern has adjacent fields, ``**``, or an invalid field name."""
     if re.search(r"\}\{", pattern):
         raise SettingsError(f"{path}: {name} = {pattern!r}: put a character between the two fields: {{a}}_{{b}}")
     if "**" in pattern:

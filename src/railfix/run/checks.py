@@ -1,4 +1,4 @@
-"""Checks that the inputs of a run match each other, and that a run has positions."""
+"""Checks that the inputs of a run match each other, and that the run has positions."""
 
 from __future__ import annotations
 
@@ -22,26 +22,25 @@ from railfix.track.track import ANOTHER_PLACE_M
 from railfix.track.trajectory import Trajectory
 
 _SECOND: Final = np.timedelta64(1, "s")
-#: Number of conventional positions after which a run is stopped if all these positions are farther from the line than
+#: Number of conventional positions per antenna after which a run stops if all of them are farther from the line than
 #: `ANOTHER_PLACE_M`.
 ENOUGH_TO_STOP: Final = 10
-#: Largest time between a log and its navigation records; if the time is longer, the records are taken to be of another
-#: day.
+#: Largest time between a log and its navigation records. Records at a larger distance are assumed to be of another day.
 ANOTHER_DAY: Final = np.timedelta64(24, "h")
-#: Sensors with samples only at events. They have no samples for a long time if the train is at rest, or passes no
+#: Sensors with samples only at events. They may have no samples for a long time, if the train is at rest or passes no
 #: balise or ground unit.
 _OF_EVENTS: Final = ("tachometer", "ranging", "balises")
-#: Longest time between the reference time of a navigation record and an epoch for which the record may be used
-#: (Galileo: 4 h).
+#: Longest time from the reference time of a navigation record to an epoch at which the record is usable. Galileo
+#: records have the longest of all constellations, 4 h.
 RECORD_REACH: Final = np.timedelta64(4, "h")
 
 
-#: First and last time of a log, of messages, or of navigation records.
+#: First and last time of a log, or of messages or navigation records.
 Span = tuple[np.datetime64, np.datetime64]
 
 
 def navigation_times(navigation: Navigation) -> Datetimes:
-    """Return the reference times of all navigation records and the times of precise orbits, in ascending order."""
+    """Return the reference times of all navigation records and precise orbits, in ascending order."""
     times = [navigation.kepler.toe, navigation.glonass.toe]
     if navigation.precise is not None:
         times.append(navigation.precise.time)
@@ -50,13 +49,13 @@ def navigation_times(navigation: Navigation) -> Datetimes:
 
 
 def navigation_span(navigation: Navigation) -> Span | None:
-    """Return the first and the last of `navigation_times`; None without records."""
+    """Return the first and last of the `navigation_times`, or None if there are no records."""
     times = navigation_times(navigation)
     return (times[0], times[-1]) if len(times) else None
 
 
 def check_each_file(navigation: Navigation, log: Log) -> None:
-    """Raise MismatchError if one of several files of a log begins more than a day from all navigation records."""
+    """Raise MismatchError if a file of a log begins more than a day from all navigation records."""
     times = navigation_times(navigation)
     for path, first in log.first_epochs() if len(times) else ():
         if np.abs(times - first).min() > ANOTHER_DAY:
@@ -67,17 +66,17 @@ def check_each_file(navigation: Navigation, log: Log) -> None:
 
 
 def _spans(tally: Tally) -> dict[str, Span]:
-    """Return the first and last epoch of each antenna."""
+    """Return the times of each antenna's first and last epoch."""
     return {n: (a.first, a.last) for n, a in tally.antennas.items() if a.first is not None and a.last is not None}
 
 
 def spans_apart(one: Span, other: Span, *, reach: np.timedelta64 = _SECOND * 0) -> bool:
-    """Return whether two spans, the first extended by `reach` at both ends, have no common time; False for NaT."""
+    """Return whether two spans have no common time; the first is extended by `reach` at both ends. False for NaT."""
     return bool(one[0] - reach > other[1] or one[1] + reach < other[0])
 
 
 def check_same_day(navigation: Navigation, tally: Tally, *, reach: np.timedelta64 = ANOTHER_DAY) -> None:
-    """Raise MismatchError if no pseudorange was used and no navigation record is within `reach` of the log."""
+    """Raise MismatchError if no pseudorange was used, because no navigation record is within `reach` of a log."""
     if any(antenna.used for antenna in tally.antennas.values()):
         return
     span = navigation_span(navigation)
@@ -97,8 +96,8 @@ def check_same_day(navigation: Navigation, tally: Tally, *, reach: np.timedelta6
 def check_same_place(tally: Tally, *, antennas: Literal["all", "any"] = "any") -> None:
     """Raise MismatchError if all conventional positions are farther than `ANOTHER_PLACE_M` from the line.
 
-    With "all", which is used during a run, every antenna must have at least `ENOUGH_TO_STOP` positions, all of them far
-    from the line. With "any", which is used at the end of a run, one antenna with at least one position suffices.
+    During a run, `antennas` is "all": the error requires that every antenna has at least `ENOUGH_TO_STOP` positions,
+    all far from the line. At the end, `antennas` is "any": one antenna with positions, all far from the line, suffices.
     """
     enough = ENOUGH_TO_STOP if antennas == "all" else 1
     elsewhere = [
@@ -134,10 +133,10 @@ def check_sbas_time(corrections: MessageCorrections | None, tally: Tally) -> Non
 
 
 def check_sensor_time(sensors: SensorSamples, tally: Tally) -> tuple[str, ...]:
-    """Return a note on each event sensor (pulses, ranges, balises) without a sample during the logs.
+    """Return a note on each event sensor (`_OF_EVENTS`) whose table and the logs have no time in common.
 
-    Raise MismatchError if another sensor has no sample during the logs, or an event sensor has no sample within a day
-    before or after the logs.
+    Raise MismatchError if the table of another sensor and the logs have no time in common, or if the table of an event
+    sensor is more than a day from the logs.
     """
     spans, notes = list(_spans(tally).values()), []
     for name, samples in sensors.tables.items():
@@ -156,7 +155,7 @@ def check_sensor_time(sensors: SensorSamples, tally: Tally) -> tuple[str, ...]:
 
 
 def check_base(base: BaseLog, tally: Tally, trajectories: Mapping[str, Trajectory]) -> None:
-    """Raise MismatchError if a base station is too far from the line, or has no epoch during or just before a log."""
+    """Raise MismatchError if a base station is too far from the line, or its log and all other logs do not overlap."""
     distance = min(np.linalg.norm(own.ecef_m - base.ecef_m, axis=1).min() for own in trajectories.values()) / 1e3
     if distance > LONGEST_KM:
         raise MismatchError(
@@ -180,10 +179,10 @@ def check_whole_run(
     sensors: SensorSamples | None = None,
     causes: Mapping[str, str] | None = None,
 ) -> tuple[str, ...]:
-    """Check the inputs and results of a whole run, and return notes on sensors without a sample during the logs.
+    """Check the inputs and results of a whole run, and return the notes of `check_sensor_time`.
 
-    `causes` has the likely cause of missing positions by antenna, for the error message. Raise MismatchError if the
-    inputs do not match each other. Raise NoPositionError if the run has no position.
+    `causes` has the likely cause of missing positions by antenna; it is part of the error message. Raise MismatchError
+    if the inputs do not match each other. Raise NoPositionError if the run has no position.
     """
     check_same_time(tally)
     check_same_day(navigation, tally, reach=RECORD_REACH)
@@ -195,7 +194,7 @@ def check_whole_run(
 
 
 def check_positions(tally: Tally, likely: Mapping[str, str]) -> None:
-    """Raise NoPositionError with the most frequent status and rejection reason if a run has no position."""
+    """Raise NoPositionError if a run has no position; the message has the most frequent status and rejection reason."""
     if tally.positioned:
         return
     if not tally.epochs:

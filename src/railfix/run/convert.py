@@ -1,8 +1,7 @@
 """Conversion of receiver logs to RINEX, and of the positions of a run to ROS 2 messages and EGNSS MATE tables.
 
-The message definitions in an MCAP file are from sensor_msgs and from https://github.com/EGNSS-MATE/emate_ros (MIT,
-commit 9067868 of 16 April 2024, for ROS 1); a third message, railfix_msgs/Row, contains one row of the table of
-positions.
+The ROS 2 message definitions are from sensor_msgs and from https://github.com/EGNSS-MATE/emate_ros (MIT, commit 9067868
+of 16 April 2024, for ROS 1). A third message, railfix_msgs/Row, contains one row of the table of positions.
 """
 
 from __future__ import annotations
@@ -45,10 +44,10 @@ def convert_logs(
     reading: LogReading | None = None,
     overwrite: Overwrite = "refuse",
 ) -> list[str]:
-    """Write the logs of one receiver as RINEX files, and return lines of text on the written files and skipped items.
+    """Write the logs of one receiver as RINEX files. Return lines of text on the written files and the skipped items.
 
-    `out` receives the observations, `nav_out` the ephemerides; None omits the file. `rinex` selects version 3.04 or
-    4.02. Raise InputFileError if a log cannot be read, or the logs contain no data for one of the RINEX files. Raise
+    Observations are written to `out`, and ephemerides to `nav_out`; if None, the file is not written. `rinex` selects
+    version 3.04 or 4.02. Raise InputFileError if a log cannot be read, or if the logs have no data for a file. Raise
     OutputError if `out` and `nav_out` are the same file, or if one of them exists already, is an input, or cannot be
     written.
     """
@@ -81,7 +80,7 @@ def convert_logs(
 
 
 def _scan(logs: tuple[Path, ...], reading: LogReading) -> tuple[ObservationHeader, int, Counter[str], list[str]]:
-    """Return the header with the signals of the whole log, the number of epochs, the skipped items, and notes."""
+    """Return the header with the signals of the whole log, the number of epochs, counts of skipped items, and notes."""
     signals: dict[str, set[str]] = {}
     channels: dict[str, int] = {}
     header, epochs, skipped, problems = ObservationHeader(), 0, Counter[str](), list[str]()
@@ -118,13 +117,13 @@ _APPROXIMATED: Final = 1
 
 
 def write_mcap(rows: pl.DataFrame, path: Path, *, description: str) -> int:
-    """Write the rows with coordinates of a table of positions as ROS 2 messages in an MCAP file; return the row count.
+    """Write a table of positions as ROS 2 messages in an MCAP file. Return the number of rows written.
 
-    Each antenna has the topics ``/ANTENNA/fix`` (sensor_msgs/NavSatFix), ``/ANTENNA/row`` (all columns) and, for the
-    filter only, ``/ANTENNA/track`` (emate_msgs/FusionResultTrack). Time stamps are UTC. Absent numbers are NaN, and
-    absent strings are empty. `description`, a text on the kind of positions and the frame of the coordinates, is stored
-    in the file. Raise NoPositionError if no row has coordinates. Raise SettingsError if mcap-ros2-support is not
-    installed.
+    Only rows with coordinates are written. Each antenna has the topics ``/ANTENNA/fix`` (sensor_msgs/NavSatFix),
+    ``/ANTENNA/row`` (all columns) and, for filtered positions, ``/ANTENNA/track`` (emate_msgs/FusionResultTrack). Time
+    stamps are UTC. Absent numbers are NaN; absent strings are empty. `description` states the kind of positions and the
+    reference frame in the file. Raise NoPositionError if no row has coordinates, and SettingsError if mcap-ros2-support
+    is not installed.
     """
     with needs_extra():
         from mcap_ros2.writer import Writer
@@ -164,7 +163,7 @@ def write_mcap(rows: pl.DataFrame, path: Path, *, description: str) -> int:
 
 
 def _fix(row: dict[str, Any]) -> dict[str, Any]:
-    """Return the values of a sensor_msgs/NavSatFix message, with the variance along the line for each axis."""
+    """Return the values of a sensor_msgs/NavSatFix message. All three axes have the variance along the line."""
     return {
         "latitude": row["latitude_deg"],
         "longitude": row["longitude_deg"],
@@ -175,7 +174,7 @@ def _fix(row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _track(row: dict[str, Any], travelled_m: float) -> dict[str, Any]:
-    """Return the values of an emate_msgs/FusionResultTrack message, whose x axis points toward rising chainage."""
+    """Return the values of an emate_msgs/FusionResultTrack message; its x axis points toward rising chainage."""
     nan = float("nan")
     on_network = bool(row.get("track"))
     return {
@@ -198,8 +197,8 @@ def result_tables(train: pl.DataFrame, passings: pl.DataFrame | None, track: Tra
     """Return the EGNSS MATE tables R_TRACK and R_ETCS_TPR of the first antenna of a run.
 
     `train` and `passings` are tables of the run. The last relevant balise group (LRBG) of a row is the group that was
-    read last according to `passings`; the LRBG is empty before the first reading. Each section of the track is one
-    track edge of the tables.
+    read last according to `passings`; before the first reading, the LRBG is null. Each section of the track is written
+    as one track edge.
     """
     rows = train.filter((pl.col("antenna") == pl.col("antenna").first()) & pl.col("chainage_m").is_not_null())
     chainage, speed = rows["chainage_m"].to_numpy(), rows["speed_mps"].to_numpy()
@@ -246,7 +245,7 @@ def result_tables(train: pl.DataFrame, passings: pl.DataFrame | None, track: Tra
 
 
 def add_mate_results(folder: OutputFolder, track: Track, log: Path) -> None:
-    """Write R_TRACK.parquet and R_ETCS_TPR.parquet if the log is an EGNSS MATE table and the filter was on."""
+    """Write R_TRACK.parquet and R_ETCS_TPR.parquet if the log is an EGNSS MATE table and the filter was used."""
     train = folder.staging / "train.parquet"
     if not (mate_table(log) and train.exists()):
         return
@@ -261,7 +260,7 @@ def _metres(values: np.ndarray) -> pl.Series:
 
 
 def _last_balise(rows: pl.DataFrame, passings: pl.DataFrame | None) -> pl.DataFrame:
-    """Return the last balise read before each row, and its chainage; null and NaN before the first reading."""
+    """Return the last balise read before each row, and its chainage; null and NaN if none was read before."""
     empty = pl.DataFrame(schema={"read_gpst": pl.Datetime("ns"), "balise": pl.String, "chainage_m": pl.Float64})
     read = empty if passings is None else passings.filter(pl.col("verdict") == "read").select(empty.columns)
     times = rows.select(pl.col("time_gpst").cast(pl.Datetime("ns")))
@@ -270,5 +269,5 @@ def _last_balise(rows: pl.DataFrame, passings: pl.DataFrame | None) -> pl.DataFr
 
 
 def _columns_of_schema(table: str, rows: pl.DataFrame, values: dict[str, Any]) -> pl.DataFrame:
-    """Return a table with the columns of the EGNSS MATE schema, in order; columns without values are null."""
+    """Return a table with the columns of the EGNSS MATE schema, in schema order. Columns without values are null."""
     return rows.select(**{name: values.get(name, pl.lit(None)) for name in WRITTEN[table]})

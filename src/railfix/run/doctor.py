@@ -1,4 +1,4 @@
-"""Examination of files before a run: kind and content of each file, missing files, and the command to run."""
+"""Examination of files before a run: kind and content of each file, missing files, and the `railfix run` command."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ class FileFinding:
     kind: Kind
     facts: tuple[str, ...]  #: Short descriptions of the content, shown to the user.
     span: Span | None = None  #: First and last time of the content, GPS time; None if unknown.
-    place_ecef_m: Floats | None = None  #: A position in the file, ECEF, shape (3,) [m]; None if unknown.
-    #: First and last reference time of the ephemerides in the file; None if there are none.
+    place_ecef_m: Floats | None = None  #: Approximate position of the content, ECEF, shape (3,) [m], or None.
+    #: First and last reference time of the ephemerides in the file, or None if the file has no ephemerides.
     ephemerides: Span | None = None
     options: tuple[str, ...] = ()  #: Command-line options that are needed to read the file.
     problems: tuple[str, ...] = ()  #: Sentences on faults of the file itself.
@@ -64,7 +64,7 @@ class Diagnosis:
 
     findings: tuple[FileFinding, ...]
     problems: tuple[str, ...]  #: Sentences on faults, mismatches and missing files.
-    command: str  #: Command that positions the logs; "" if a file needed for the command is missing.
+    command: str  #: Command that positions the logs, or "" if a required file is missing.
 
     def as_dict(self) -> dict[str, Any]:
         """Return the diagnosis as plain values for JSON."""
@@ -88,8 +88,8 @@ class Diagnosis:
 def examine_files(paths: Sequence[Path], *, date: np.datetime64 | None = None) -> Diagnosis:
     """Examine each file, and compare the files with each other.
 
-    `date` is a time within half a week of the logs, needed for logs that do not state the week. Raise InputFileError if
-    a file is missing, a folder, or given twice.
+    `date` is a time within half a week of the logs; it is required for logs that do not state the week. Raise
+    InputFileError if a path does not exist, is a folder, or occurs twice.
     """
     for path in paths:
         if path.is_dir():
@@ -106,8 +106,8 @@ def examine_files(paths: Sequence[Path], *, date: np.datetime64 | None = None) -
 def _examine(path: Path, date: np.datetime64 | None) -> FileFinding:
     """Return the properties of a file.
 
-    The file is read as each kind that its content suggests, until a reader accepts the file. If no reader accepts the
-    file, the first error is returned as its problem.
+    The readers of all kinds that the content suggests are tried until one accepts the file. If no reader accepts the
+    file, the first error is returned as the file's problem.
     """
     errors, kinds = list[str](), _find_kinds(path)
     for kind in kinds:
@@ -115,7 +115,7 @@ def _examine(path: Path, date: np.datetime64 | None) -> FileFinding:
             return _DATED[kind](path, date) if kind in _DATED else _READERS[kind](path)
         except RailfixError as error:
             errors.append(str(error))
-            if "--date" in str(error):  # the reader is right, but requires the date
+            if "--date" in str(error):  # the kind is right, but its reader requires the date
                 return FileFinding(path=path, kind=kind, facts=(), problems=(errors[-1],))
     kind = "unknown" if len(kinds) > 1 else kinds[0]
     return FileFinding(path=path, kind=kind, facts=(), problems=(errors[0],))
@@ -136,7 +136,7 @@ def _find_kinds(path: Path) -> tuple[Kind, ...]:
     return _KINDS.get(kind, ("unknown",))
 
 
-#: Columns of maps and logs of positions, for messages.
+#: Columns of track maps and position logs, for messages.
 _PLACES: Final = "a track map has latitude_deg and longitude_deg, a log of positions also times, or x_m, y_m, z_m"
 
 
@@ -150,7 +150,7 @@ def _unknown(path: Path) -> FileFinding:
 
 
 def _observations(path: Path, date: np.datetime64 | None) -> FileFinding:
-    """Return the properties of a log of observations, which is read piece by piece to save memory."""
+    """Return the properties of an observation log. The log is read in pieces to save memory."""
     header: ObservationHeader | None = None
     times, channels = [np.empty(0, dtype="datetime64[ns]")], set[tuple[str, str]]()
     broken, notes = Counter[str](), list[str]()
@@ -190,7 +190,7 @@ def _observations(path: Path, date: np.datetime64 | None) -> FileFinding:
 
 
 def _needs_lenient(path: Path, date: np.datetime64 | None) -> bool:
-    """Return whether the reader fails on the file without the option --lenient."""
+    """Return whether the file can be read only with the option --lenient."""
     try:
         for _ in scan_observations(path, date=date):
             pass
@@ -200,12 +200,12 @@ def _needs_lenient(path: Path, date: np.datetime64 | None) -> bool:
 
 
 def _own_ephemerides(path: Path, date: np.datetime64 | None) -> tuple[int, Span] | None:
-    """Return the number of ephemerides in a receiver's log, and the span of their times; None without ephemerides."""
+    """Return the number of ephemerides in a receiver log, and the span of their times; None without ephemerides."""
     if find_kind(path) != "receiver":
         return None
     try:
         navigation = read_navigation([path], date=date)
-    except InputFileError:  # the log has no navigation records, which is not a fault
+    except InputFileError:  # a log without navigation records is no fault
         return None
     span = navigation_span(navigation)
     return None if span is None else (len(navigation.kepler) + len(navigation.glonass), span)
@@ -227,14 +227,14 @@ def _navigation(path: Path, date: np.datetime64 | None) -> FileFinding:
 
 
 def _track(path: Path) -> FileFinding:
-    """Return the properties of a track map, which may be a route or a network, and may lack heights."""
+    """Return the properties of a track map. The map may be a route or a network, and may lack heights."""
     options, problems, datum = tuple[str, ...](), tuple[str, ...](), ""
     try:
         segments = read_segments(path, MapReading())
     except (InputFileError, SettingsError) as error:
         if "--height-datum" not in str(error) and "height datum" not in str(error):
             raise
-        # OGC KML 2.3, 13.9: absolute altitudes are above EGM96
+        # In KML, absolute altitudes are above the EGM96 geoid (OGC KML 2.3, 13.9).
         kml = path.suffix.lower() in (".kml", ".kmz")
         datum = "orthometric" if kml else "ellipsoidal"
         segments = read_segments(path, MapReading(height_datum="ellipsoidal"))  # the checks do not need a geoid
@@ -331,7 +331,7 @@ def _sbas(path: Path) -> FileFinding:
     return FileFinding(path=path, kind="sbas", facts=facts, span=(messages.time.min(), messages.time.max()))
 
 
-#: Kinds of input for which a file can be used, by file kind.
+#: Kinds of input that a file may be, by file kind.
 _KINDS: Final[dict[FileKind, tuple[Kind, ...]]] = {
     "observations": ("observations",),
     "navigation": ("navigation",),
@@ -342,13 +342,13 @@ _KINDS: Final[dict[FileKind, tuple[Kind, ...]]] = {
     **{kind: ("track",) for kind in MAPS if kind not in POSITIONS},
     **dict.fromkeys(("nmea", "novatel", "rtklib"), ("positions",)),
 }
-#: Readers with two arguments, the path and the date of the log, by kind of input.
+#: Readers by kind of input, for readers with two arguments: path and date of the log.
 _DATED: Final[dict[Kind, Callable[[Path, np.datetime64 | None], FileFinding]]] = {
     "observations": _observations,
     "navigation": _navigation,
     "positions": _positions,
 }
-#: Readers with the path as the only argument, by kind of input.
+#: Readers by kind of input, for readers with the path as the only argument.
 _READERS: Final[dict[Kind, Callable[[Path], FileFinding]]] = {
     "track": _track,
     "orbits": _orbits,
@@ -373,7 +373,7 @@ def _filter(findings: Sequence[FileFinding], kind: Kind) -> list[FileFinding]:
 
 
 def _problems(findings: Sequence[FileFinding]) -> list[str]:
-    """Return sentences on the faults of each file, on files missing for a run, and on mismatches between files."""
+    """Return sentences on faults in files, on missing files that a run requires, and on mismatches between files."""
     problems = [problem for finding in findings for problem in finding.problems]
     logs, tracks = (_filter(findings, kind) for kind in ("observations", "track"))
     readable = [log for log in logs if log.span is not None]
@@ -421,7 +421,7 @@ def _problems(findings: Sequence[FileFinding]) -> list[str]:
 
 
 def _command(findings: Sequence[FileFinding], date: np.datetime64 | None) -> str:
-    """Return the command that positions the logs with these files; "" if a file needed for the command is missing."""
+    """Return the command that positions the logs with these files, or "" if a required file is missing."""
     logs, tracks = (_filter(findings, kind) for kind in ("observations", "track"))
     logs = [log for log in logs if log.span is not None]
     tracks = [track for track in tracks if track.place_ecef_m is not None]

@@ -1,4 +1,4 @@
-"""Examination of the tables of on-board sensors, balises, sections and heights, by the readers of the commands."""
+"""Examination of tables of on-board sensors, balises, sections and heights."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ TableKind = Literal[
     "acceleration", "sections", "heights",
 ]  # fmt: skip
 TABLE_KINDS: Final[tuple[TableKind, ...]] = get_args(TableKind)
-#: Kinds of EGNSS MATE tables that are neither observations nor maps.
+#: Kind of each EGNSS MATE table that contains neither observations nor a track map.
 _OF_MATE: Final[Mapping[str, TableKind]] = {
     "S_IMU": "inertial", "S_SPEEDOMETER": "radar", "S_BALISEREADER": "balises", "S_DM_BALISE": "list of balises",
 }  # fmt: skip
-#: For each kind, the option that accepts the table, preceded by the command if the command is not `railfix run`.
+#: Option that accepts a table, by kind. The command is also named if it is not `railfix run`.
 _OPTIONS: Final[Mapping[TableKind, str]] = {
     **{kind: f"--{kind.replace('_', '-')}" for kind in TABLE_KINDS},
     "list of balises": "--balise-list or --virtual-balises", "pulses": "railfix reference --pulses",
     "acceleration": "railfix reference --acceleration", "sections": "railfix evaluate --sections",
 }  # fmt: skip
-#: For each kind of table that is used only with another table, the kind of the other table.
+#: Tables that are used only in pairs: kind of the partner table by kind of table.
 PAIRS: Final[Mapping[TableKind, TableKind]] = {
     "ranging": "ranging_units", "ranging_units": "ranging", "balises": "list of balises", "list of balises": "balises",
 }  # fmt: skip
 
 
 def find_table_kind(path: Path) -> TableKind | Literal["other"] | None:
-    """Return the kind of a table from its header; None if its columns are those of a map or of a log of positions.
+    """Return the kind of a table from its header, or None if the table is a track map or a position log.
 
     The kind is "other" if railfix reads no table with these columns.
     """
@@ -64,13 +64,13 @@ def find_table_kind(path: Path) -> TableKind | Literal["other"] | None:
         return "sections"
     if names & {"chainage_m", "kilometrage_m"} and names & {"height_m", "elevation_m"}:
         return "heights"
-    # results and ground truth have these columns
+    # tables with these columns are results or ground truth
     found = None if names & {"antenna", "read"} else find_sensor_table(columns)
     return next((table for table in TABLE_KINDS if table == found), "other")
 
 
 def read_table_facts(path: Path, kind: TableKind) -> tuple[str, Span | None]:
-    """Return a phrase on the content of a table, and the span of its times; raise the errors of the table's reader."""
+    """Return a phrase on the content of a table, and the span of its times. Errors of the table's reader are raised."""
     if kind in SENSORS:
         samples = read_sensors(**{kind: path}).tables[kind]
         return _phrase(kind, plural(len(samples), "reading")), _span(samples.time)
@@ -103,7 +103,7 @@ def _span(time: Datetimes) -> Span | None:
 
 
 def sensor_options(tables: Mapping[TableKind, Path]) -> list[str]:
-    """Return the options of `railfix run` for tables of sensors by kind; tables without their partner are omitted."""
+    """Return the options of `railfix run` for sensor tables. Tables without their partner (`PAIRS`) are omitted."""
     words = []
     for kind, path in tables.items():
         of_run = kind in SENSORS or kind in PAIRS.values()

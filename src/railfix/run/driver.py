@@ -1,4 +1,4 @@
-"""Positioning of the logs of a run, chunk by chunk, and writing of the tables and the record of the run."""
+"""Positioning of the logs of a run in chunks, and writing of the run's tables and record."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class RunSummary:
 
     tally: Tally  #: Counts of all epochs and observations.
     record: Mapping[str, Any]  #: Content of ``run.json``.
-    verdict: Verdict  #: Verdict on the run for the terminal, the report and JSON.
+    verdict: Verdict  #: Verdict on the run.
     files: Mapping[str, Path]  #: Paths of the written files by name.
     wall_s: float  #: Elapsed time of the run [s].
 
@@ -85,9 +85,9 @@ def run_files(
 ) -> RunSummary:
     """Position the logs of one run along its line and write the results into the folder `out`.
 
-    `config` has all settings; `asked` has only the explicitly given settings, which are recorded in ``run.json``. Notes
-    are issued as `RailfixWarning`. Raise a RailfixError (`railfix.core.errors`) and leave `out` unchanged if the run
-    fails.
+    `config` has all settings. `asked` has only the settings that the user specified; they are recorded in ``run.json``.
+    Notes are issued as `RailfixWarning`. If the run fails, raise a RailfixError (`railfix.core.errors`) and leave `out`
+    unchanged.
     """
     began = clock.perf_counter()
     config, options = config or Config(), options or RunOptions()
@@ -152,7 +152,7 @@ def run_files(
 
 
 def _judge(record: Mapping[str, Any]) -> Verdict:
-    """Return the verdict on a run; raise NoPositionError if the run has no usable position."""
+    """Return the verdict on a run. Raise NoPositionError if the run has no usable position."""
     verdict = judge_run(record)
     if not any(antenna.is_usable for antenna in verdict.antennas):
         raise NoPositionError(verdict.failure())
@@ -162,7 +162,7 @@ def _judge(record: Mapping[str, Any]) -> Verdict:
 def open_inputs(
     inputs: RunInputs, options: RunOptions, config: Config
 ) -> tuple[Navigation, OpenedLine, dict[Antenna, Log]]:
-    """Read navigation data and line, and open the logs by antenna; in a network of tracks, find the route first."""
+    """Read the navigation data and the line, and open the log of each antenna. In a track network, find the route."""
     navigation = read_navigation(inputs.nav, **options.logs.arguments)
     if inputs.sp3:
         from railfix.io.sp3 import read_sp3
@@ -197,7 +197,7 @@ def open_inputs(
 
 
 def find_record_time(navigation: Navigation) -> np.datetime64 | None:
-    """Return the median time of the navigation records, as the epoch of reference frames; None without records."""
+    """Return the median time of the navigation data, used as epoch of reference frames, or None without data."""
     clocks = np.concatenate([navigation.kepler.toc, navigation.glonass.toe])
     if navigation.precise is not None:
         clocks = navigation.precise.time
@@ -205,7 +205,7 @@ def find_record_time(navigation: Navigation) -> np.datetime64 | None:
 
 
 def read_samples_and_units(inputs: RunInputs) -> tuple[SensorSamples, GroundUnits | None]:
-    """Read the samples of the on-board sensors, and the ground units of two-way ranges; None without ranges."""
+    """Read the samples of the on-board sensors, and the ground units of two-way ranging (None without ranges)."""
     samples = read_sensors(
         tachometer=inputs.tachometer, inertial=inputs.inertial, radar=inputs.radar, ranging=inputs.ranging,
         balises=inputs.balises,
@@ -221,10 +221,10 @@ def _position(
     beside: Executor,
     progress: Progress | None,
 ) -> Tally:
-    """Position the logs chunk by chunk and return the counts.
+    """Position the logs in chunks, and return the counts of the run.
 
-    Five stages run in parallel on consecutive chunks: reading, screens, single epochs, filter, and writing (in the
-    executor `beside`). `others` are the samples of the on-board sensors and the log of the base station.
+    Five stages run in parallel on consecutive chunks: reading, screens, single-epoch positioning, filter, and writing
+    (in the executor `beside`). `others` are the samples of the on-board sensors and the base-station log.
     """
     tolerance_s = processor.config.antenna_pair.tag_tolerance_s
     tally = Tally(
@@ -260,7 +260,7 @@ def _screen_chunks(
     others: tuple[SensorSamples, BaseLog | None],
     processor: EpochProcessor,
 ) -> Iterator[Chunk]:
-    """Yield the screened chunks, each with the sensor samples and base-station epochs up to the end of the chunk."""
+    """Yield the screened chunks, each with the sensor samples and base-station epochs up to its end."""
     samples, station = others
     after, state = np.datetime64("NaT", "ns"), State()
     for chunk in chunks:
@@ -282,7 +282,7 @@ def _single_epochs(screened: Iterator[Chunk], processor: EpochProcessor) -> Iter
 def _causes(
     tally: Tally, logs: Mapping[Antenna, Log], processor: EpochProcessor, config: Config, line: OpenedLine
 ) -> dict[str, str]:
-    """Return the likely cause for each antenna with at least 90 % of its positions off the line; "" if not found."""
+    """Return the likely cause, or "", for each antenna with 90 % of its positions off or contradicting the map."""
     causes: dict[str, str] = {}
     for name in logs:
         antenna = tally.antennas[name]
@@ -299,16 +299,16 @@ def _causes(
 def _notes_of_sensors(
     checks: SensorChecks | None, sensors: SensorSamples, units: GroundUnits | None, line: OpenedLine, config: Config
 ) -> tuple[str, ...]:
-    """Return notes on sensors whose settings or tables contradict satellite positioning; empty without sensors."""
+    """Return notes on sensors whose settings or tables contradict satellite positioning."""
     if checks is None:
         return ()
     trajectory = next(iter(line.trajectories.values()))
     return (*checks.notes(sensors, units, trajectory, config.sensors), *checks.radar_alarms(sensors.radar))
 
 
-#: Last clause of a note on positions off the map if their cause was not found.
+#: Last clause of a note on positions off the map, if their cause is unknown.
 _TRACK: Final = "check whether this is the right track"
-#: Maximum number of excluded satellites that a note names.
+#: Maximum number of notes on excluded satellites, per antenna and stage.
 _NAMED: Final = 3
 
 
@@ -323,8 +323,8 @@ def collect_notes(
 ) -> tuple[str, ...]:
     """Return the notes of a run without repetitions.
 
-    `causes` has the likely cause for each antenna without a position on the line. There is a note on the offset of the
-    map if the test statistic of the offset exceeds `note_statistic`.
+    `causes` has the likely cause of positions off the map, by antenna. A map offset is noted if its test statistic
+    exceeds `note_statistic`.
     """
     notes = [
         *line.notes,
@@ -369,12 +369,12 @@ def collect_notes(
     return tuple(dict.fromkeys(notes))
 
 
-#: Differences of other time scales from GPS time [s], by which time tags in a wrong scale are recognised.
+#: Other time scales by their difference from GPS time [s], by which time tags in a wrong scale are recognised.
 _SCALES: Final = {-18.0: "UTC", -14.0: "BeiDou time", 19.0: "TAI"}
 
 
 def _describe_sign(sign: str, tag_error_s: tuple[float, float]) -> str:
-    """Return a description of a sign of interference for the beginning of a sentence.
+    """Return a description of a sign of interference, as the beginning of a sentence.
 
     `tag_error_s` are the smallest and largest time-tag error [s], positive for late tags.
     """
@@ -393,12 +393,12 @@ def _describe_sign(sign: str, tag_error_s: tuple[float, float]) -> str:
     return f"the time tags are {size} {which}, so there is no protection level ({guess})"
 
 
-#: Largest spread of a constant time-tag error [s].
+#: Largest spread of a time-tag error that is taken as constant [s].
 _STEADY_S: Final = 0.5
 
 
 def _describe_detectable(detectable_m: Floats) -> str:
-    """Return a clause on the map offsets that the run cannot detect, from `AntennaTally.map_detectable_m`."""
+    """Return a clause on undetectable map offsets, given `AntennaTally.map_detectable_m`."""
     if np.isnan(detectable_m).any():
         return "the map was not tested against the positions: there is no minute of 3-D positions with redundant ranges"
     (across, up), (most_across, most_up) = detectable_m.tolist()
@@ -409,7 +409,7 @@ def _describe_detectable(detectable_m: Floats) -> str:
 
 
 def _notes_of_levels(config: Config, tally: Tally) -> Iterator[str]:
-    """Yield notes on missing protection levels, the basis of the fault priors, and a prior that the run contradicts."""
+    """Yield notes on missing protection levels, the basis of the fault priors, and priors that the run contradicts."""
     if not any(antenna.level_status for antenna in tally.antennas.values()):
         return
     for name, of_antenna in tally.antennas.items():
@@ -428,7 +428,7 @@ def _notes_of_levels(config: Config, tally: Tally) -> Iterator[str]:
         return
     used = sum(antenna.used for antenna in tally.antennas.values())
     excluded = sum(antenna.first_reason["fault_excluded"] for antenna in tally.antennas.values())
-    # Without faults, exclusions occur at the rate of false alarms; a significantly larger rate contradicts the prior.
+    # If the fault rate implied by exclusions beyond the false alarms significantly exceeds the prior, note this.
     observed = sum(antenna.observed for antenna in tally.antennas.values())
     faults = excluded - config.raim.false_alarm * observed
     prior = risk.local_prior + max(risk.satellite_prior.values())
@@ -441,7 +441,7 @@ def _notes_of_levels(config: Config, tally: Tally) -> Iterator[str]:
 
 
 def _footer(files: Iterable[Mapping[str, Any]], notes: Iterable[str]) -> dict[str, str]:
-    """Return the metadata for the footers of the Parquet files: version, command, inputs and notes."""
+    """Return the metadata for the Parquet file footers: version, command, inputs and notes."""
     return {
         "railfix": __version__,
         "command": " ".join(sys.argv),

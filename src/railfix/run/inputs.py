@@ -1,4 +1,4 @@
-"""Input files of a run, with checks and hashes, and options that do not change the positions."""
+"""Input files of a run, with checks and hashes, and options of a run."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from railfix.track.frames import MapMotion
 from railfix.track.route import MapReading
 from railfix.track.vehicle import Reference
 
-#: Value of `RunInputs.heights` by which the heights of the log's own positions are used.
+#: Value of `RunInputs.heights` that selects the heights of the log's own positions.
 OF_LOG = Path("log")
 Antenna = Literal["front", "rear"]
 
 
 def input_option(text: str, default: Any = ..., *, metavar: str = "FILE") -> Any:
-    """Return a field that is a command-line option for one or several input files."""
+    """Return a settings field for a command-line option that accepts one or several input files."""
     return option(text, default, metavar=metavar, panel=INPUTS)
 
 
@@ -62,13 +62,13 @@ VIRTUAL_BALISES: Final = (
 class InputFiles(Settings):
     """Input files of a command; each field is a path, several paths, or None."""
 
-    #: Fields with receiver logs, whose ephemerides are used if no navigation file is given.
+    #: Fields with logs. Ephemerides in receiver logs are used if no navigation file is given.
     own_navigation: ClassVar[tuple[str, ...]] = ()
 
     @model_validator(mode="before")
     @classmethod
     def _with_own_navigation(cls, values: Any) -> Any:
-        """Return the inputs with the receiver logs as navigation files if no navigation file is given."""
+        """Return the inputs, with the receiver logs as navigation files if no navigation file is given."""
         if not cls.own_navigation or not isinstance(values, dict) or values.get("nav"):
             return values
         logs = [Path(path) for name in cls.own_navigation if values.get(name) for path in path_names(values[name])]
@@ -78,7 +78,7 @@ class InputFiles(Settings):
         return {**values, "nav": own}
 
     def files_by_name(self) -> Iterator[tuple[str, Path]]:
-        """Yield each file with the name of its field."""
+        """Yield the field name and the path of each file."""
         for name in type(self).model_fields:
             value = getattr(self, name)
             for path in value if isinstance(value, tuple) else (value,):
@@ -96,7 +96,7 @@ class InputFiles(Settings):
             _check_file(f"--set {name}" if name == "integrity_support" else f"--{name.replace('_', '-')}", path)
 
     def entries(self, pool: Executor, folder: Path) -> Entries:
-        """Submit the `fingerprint` of each file to the executor `pool`; paths are recorded relative to `folder`."""
+        """Compute the `fingerprint` of each file in the executor `pool`, with paths relative to `folder`."""
         return [
             pool.submit(fingerprint, kind, path, name=record_path(path, folder)) for kind, path in self.files_by_name()
         ]
@@ -106,7 +106,7 @@ Entries = Sequence[Future[dict[str, Any]]]
 
 
 class RunInputs(InputFiles):
-    """Input files of a run that are given by command-line options; the settings name further files."""
+    """Input files of a run. Command-line options specify most files; the settings name the others."""
 
     own_navigation = ("front", "rear")
     front: tuple[Path, ...] = input_option(
@@ -170,7 +170,7 @@ class RunInputs(InputFiles):
     @model_validator(mode="before")
     @classmethod
     def _with_mate(cls, values: Any) -> Any:
-        """Return the inputs with the tables in the folder `mate`; inputs that are given explicitly take precedence."""
+        """Return the inputs with the tables in the folder `mate`. Explicitly specified inputs take precedence."""
         if not isinstance(values, dict) or values.get("mate") is None:
             return values
         given = {name: value for name, value in values.items() if name != "mate" and value not in (None, ())}
@@ -184,7 +184,7 @@ class RunInputs(InputFiles):
         return self
 
     def prepare(self, config: Config) -> tuple[Self, Config]:
-        """Check inputs, add the files that settings name, replace "stream" in settings; return inputs and settings."""
+        """Check the inputs. Return them with the files that settings name, and settings without ``sbas = "stream"``."""
         self.check()
         config = self._with_own_sbas(config)
         inputs = self.with_settings(config)
@@ -192,12 +192,12 @@ class RunInputs(InputFiles):
         return inputs, config
 
     def with_settings(self, config: Config) -> Self:
-        """Return the inputs including the files that settings name."""
+        """Return the inputs, with the files that settings name."""
         models = {name: getattr(config, name) for name in ("cn0_curve", "error_model", "integrity_support")}
         return self.replaced(**models, sbas=() if config.sbas == "stream" else config.sbas)
 
     def _with_own_sbas(self, config: Config) -> Config:
-        """Return settings in which ``sbas = "stream"`` is replaced by the receiver logs, which contain SBAS messages.
+        """Return the settings with ``sbas = "stream"`` replaced by the receiver logs, which contain SBAS messages.
 
         Raise SettingsError if all logs are RINEX files.
         """
@@ -216,7 +216,7 @@ class RunInputs(InputFiles):
         return logs_by_antenna(self.front, self.rear)
 
     def check(self) -> None:
-        """Raise InputFileError if a file is missing or cannot be read, or a log or track file is given twice."""
+        """Raise InputFileError if a file is missing or cannot be read, or if a log or track file is specified twice."""
         self.check_files()
         logs = [("base", self.base), *self.logs.items()]
         check_given_once((f"--{name}", path) for name, paths in logs for path in paths)
@@ -224,13 +224,13 @@ class RunInputs(InputFiles):
 
 
 def logs_by_antenna(front: tuple[Path, ...], rear: tuple[Path, ...]) -> dict[Antenna, tuple[Path, ...]]:
-    """Return the observation files by antenna; antennas without files are omitted."""
+    """Return the observation files by antenna. Antennas without files are omitted."""
     both: dict[Antenna, tuple[Path, ...]] = {"front": front, "rear": rear}
     return {name: paths for name, paths in both.items() if paths}
 
 
 def check_given_once(files: Iterable[tuple[str, Path]]) -> None:
-    """Raise InputFileError if a file is given twice; `files` are pairs of the option's name and the path."""
+    """Raise InputFileError if a file is specified twice. `files` are pairs of option name and path."""
     seen: dict[Path, tuple[str, Path]] = {}
     for name, path in files:
         resolved = path.resolve()
@@ -241,14 +241,14 @@ def check_given_once(files: Iterable[tuple[str, Path]]) -> None:
 
 
 def record_path(path: Path, folder: Path) -> str:
-    """Return the path of an input for the record; a relative path becomes relative to the results folder."""
+    """Return the path of an input for the record. A relative path is converted to be relative to the results folder."""
     if path.is_absolute():
         return str(path)
     return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()
 
 
 def input_path(entry: Mapping[str, Any], folder: Path) -> Path:
-    """Return the present path of a recorded input; a relative recorded path refers to the results folder."""
+    """Return the present path of a recorded input. A relative recorded path is relative to the results folder."""
     path = folder / str(entry["path"])
     plain = Path(os.path.normpath(path))
     return plain if plain.exists() or not path.exists() else path
@@ -272,7 +272,7 @@ LAST_YEAR: Final = 2261
 
 
 class TrackReading(Settings):
-    """Options for reading the track, and the point of the vehicle to which the chainage refers."""
+    """Options for reading the track, and the vehicle's reference point for the chainage."""
 
     crs: str | None = option("CRS of the track, if its file does not state it.", None, metavar="EPSG")
     height_datum: str | None = option("Height datum of the track: ellipsoidal or orthometric.", None, metavar="DATUM")
@@ -322,7 +322,7 @@ class TrackReading(Settings):
 
     @property
     def motion(self) -> MapMotion:
-        """Arguments of the transformation of the track to the frame of the satellites."""
+        """Arguments for transforming the track to the reference frame of the satellites."""
         return {"epoch": self.map_epoch, "plate": self.plate, "parameters": self.jgd_parameters}
 
     cache: Literal["use", "skip"] = option(
@@ -331,7 +331,7 @@ class TrackReading(Settings):
 
 
 class LogReading(Settings):
-    """Options for reading logs and navigation files, the same for every command."""
+    """Options for reading logs and navigation files, shared by all commands."""
 
     date: datetime | None = option(
         "GPS time within half a week of the beginning of the log. It is required for RTCM 3 logs without ephemerides, "
@@ -355,22 +355,22 @@ class LogReading(Settings):
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """Keyword arguments of the readers of positions and navigation files."""
+        """Keyword arguments for the readers of position logs and navigation files."""
         return {"date": self.instant, "broken_lines": self.broken_lines}
 
     @property
     def of_observations(self) -> dict[str, Any]:
-        """Keyword arguments of the readers of observations."""
+        """Keyword arguments for the readers of observations."""
         return {**self.arguments, "reader": self.reader}
 
     @property
     def instant(self) -> np.datetime64 | None:
-        """`date` as a GPS time in nanoseconds, the type of the readers' arguments; None if `date` is not given."""
+        """`date` as numpy time, as the readers require, or None if `date` is None."""
         return None if self.date is None else np.datetime64(self.date.replace(tzinfo=None), "ns")
 
 
 class ColumnNames(Settings):
-    """Options for reading logs of positions: names of the columns of tables, and the fields of `LogReading`."""
+    """Options for reading position logs: column names of tables, and the fields of `LogReading`."""
 
     column: tuple[str, ...] = option(
         "Name of a column in CSV positions, as in time_utc=Timestamp; may be repeated. Quantities: time_gpst, "
@@ -384,17 +384,17 @@ class ColumnNames(Settings):
 
     @property
     def arguments(self) -> dict[str, Any]:
-        """Keyword arguments of `railfix.io.read_positions`."""
+        """Keyword arguments for `railfix.io.read_positions`."""
         return {"columns": self.names, **self.logs.arguments}
 
     @property
     def names(self) -> dict[str, str]:
-        """Name of the column in the file by quantity; raise SettingsError if a text is not NAME=COLUMN."""
+        """Column name in the file by quantity. Raise SettingsError if a text is not NAME=COLUMN."""
         return column_names(self.column)
 
 
 class RunOptions(Settings):
-    """Options of a run that do not change the positions."""
+    """Options of a run, in addition to the settings (`Config`)."""
 
     start: datetime | None = option("GPS time from which epochs are processed.", None, metavar="TIME")
     end: datetime | None = option("GPS time before which epochs are processed.", None, metavar="TIME")
@@ -426,7 +426,7 @@ class RunOptions(Settings):
 
     @property
     def of_filter(self) -> list[str]:
-        """Names of the given options that need the filter along the track."""
+        """Names of the selected options that require the along-track filter."""
         return ["smooth"] if self.smooth == "on" else []
 
     @field_validator("start", "end")

@@ -1,4 +1,4 @@
-"""3-D positions of logs without a map, survey of a map from several runs, and features measured by runs (P2, 2.3)."""
+"""3-D positions without a map, survey of a map from several runs, and line features measured by runs (P2, 2.3)."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class LocateSummary:
 def locate_files(
     inputs: LocateInputs, config: Config, *, out: Path, reading: LogReading | None = None
 ) -> LocateSummary:
-    """Compute the 3-D positions of a log and write them as an RTKLIB solution file with quality 5 (single).
+    """Compute the 3-D positions of a log, and write them to an RTKLIB solution file with quality 5 (single).
 
     Raise NoPositionError if no epoch has a position. Raise OutputError if the file cannot be written.
     """
@@ -91,15 +91,15 @@ def locate_files(
 
 
 def reasons_text(located: Located) -> str:
-    """Return the number of epochs without a position for each reason; "" if every epoch has a position."""
+    """Return a text with the number of epochs without a position for each reason, or "" if all have a position."""
     found = Counter(located.no_position.tolist())
     return ", ".join(f"{count} {NoPosition(reason).text}" for reason, count in sorted(found.items()) if reason)
 
 
 def solution_text(located: Located) -> str:
-    """Return the text of an RTKLIB solution file: GPST, latitude, longitude, ellipsoidal height, standard deviations.
+    """Return the text of an RTKLIB solution file with GPS time, geodetic coordinates and standard deviations.
 
-    An epoch without a position is a comment line with its time and the reason.
+    An epoch without a position is written as a comment line with the time and the reason.
     """
     lines = [
         "% program   : railfix locate",
@@ -126,9 +126,9 @@ def solution_text(located: Located) -> str:
 _CHUNK_EPOCHS: Final = 3000
 #: Number of epochs that `likely_cause` tests.
 _EPOCHS: Final = 5
-#: Distance in plan from the line within which a position counts as on the line [m].
+#: Largest horizontal distance from the line of a position that is taken to be on the line [m].
 _ON_LINE_M: Final = 150.0
-#: Height difference between positions and line that is too large to be caused by range errors [m].
+#: Height difference between positions and line above which range errors are assumed not to be the cause [m].
 _HEIGHT_M: Final = 30.0
 #: GPS time minus UTC since 2017 [s].
 _LEAP_S: Final = 18
@@ -137,17 +137,17 @@ _BEIDOU_S: Final = 14
 #: Largest time-zone shift that is tested [h].
 _HOURS: Final = 14
 _FEET: Final = 0.3048
-#: Largest difference between a height offset and the offset that a cause would explain [m].
+#: Largest difference between a height offset and the offset expected from its likely cause [m].
 _CAUSE_M: Final = 15.0
-#: Minimum distance of the geoid from the ellipsoid at which a wrong height datum is considered [m].
+#: A wrong height datum is considered if the geoid is farther than this from the ellipsoid [m].
 _GEOID_M: Final = 10.0
 
 
 def likely_cause(observations: Observations, received: Received, config: Config, line: Trajectory) -> str:
-    """Return a clause on the likely reason for positions off the line; "" if no cause was found.
+    """Return a clause on the likely cause of positions off the line, or "" if no cause was found.
 
-    Conventional positions of a few epochs are compared with the line in plan and height. If these positions do not lie
-    on the line, the comparison is repeated with time tags shifted by leap seconds and whole hours.
+    Conventional positions of a few epochs are compared with the line in plan and in height. If they are not on the line
+    in plan, the comparison is repeated with time tags shifted by leap seconds and whole hours.
     """
     step = max(len(observations) // _EPOCHS, 1)
     few = observations[: step * _EPOCHS : step]
@@ -168,7 +168,7 @@ def likely_cause(observations: Observations, received: Received, config: Config,
 
 
 def _shifts_s() -> Iterator[int]:
-    """Yield the time-tag shifts of common mistakes [s]: wrong time scales, then time zones in ascending order."""
+    """Yield the time-tag shifts that common mistakes cause [s]: first wrong time scales, then time zones."""
     for seconds in (_LEAP_S, _BEIDOU_S):
         yield from (seconds, -seconds)
     for hours in range(1, _HOURS + 1):
@@ -179,9 +179,9 @@ def _shifts_s() -> Iterator[int]:
 def _offset_m(
     observations: Observations, received: Received, config: Config, line: Trajectory
 ) -> tuple[float, float, float, float] | None:
-    """Return the median position's offset from the line in plan and height, and the heights of line and geoid [m].
+    """Return the median position's horizontal and vertical offset from the line, and the line and geoid heights [m].
 
-    The result is None if no epoch has a position.
+    Return None if no epoch has a position.
     """
     ecef: Floats = locate(observations, received, config, ChannelBook(config)).ecef_m
     if not np.isfinite(ecef[:, 0]).any():
@@ -191,13 +191,13 @@ def _offset_m(
     latitude, longitude, height = (float(value) for value in geodetic_from_ecef(place))
     geoid = float(egm96_heights(np.array([latitude]), np.array([longitude]))[0])
     of_line = float(geodetic_from_ecef(line.at_arc(arc)[0])[2])
-    # The heights of the line may be wrong. The offset in plan is therefore computed at the height of the line.
+    # The position is moved to the height of the line, so that wrong line heights do not change the offset in plan.
     level = place * (1.0 + (of_line - height) / float(np.linalg.norm(place)))
     return float(line.nearest(level[None])[1][0]), height - of_line, of_line, geoid
 
 
 def _cause_in_height(above_m: float, of_line_m: float, geoid_m: float) -> str:
-    """Return a clause on a height offset from the line, and on the unit or datum that may explain it; "" if small."""
+    """Return a clause on the height offset and the unit or datum that may explain it, or "" if the offset is small."""
     apart = f"the positions lie {abs(above_m):.0f} m {'above' if above_m > 0.0 else 'below'} the line"
     if abs(of_line_m * _FEET - of_line_m - above_m) < min(abs(above_m) / 4.0, _CAUSE_M) and abs(above_m) > _HEIGHT_M:
         return f"{apart}; the heights of the map may be in feet"
@@ -208,7 +208,7 @@ def _cause_in_height(above_m: float, of_line_m: float, geoid_m: float) -> str:
     return f"{apart}; check the datum and the unit of the map's heights" if abs(above_m) > _HEIGHT_M else ""
 
 
-#: Advice for a map whose heights were read in the wrong datum.
+#: Advice for a map whose heights were probably read in the wrong datum.
 _AS_ORTHOMETRIC: Final = (
     "the heights of the map seem to be above the geoid, not the ellipsoid: give --height-datum orthometric --geoid "
     "egm96, or in a CSV file name their column elevation_m and give --geoid egm96"
@@ -227,7 +227,7 @@ def _duration(seconds: int) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class Surveyed:
-    """Survey of a line, with its runs and notes on the files."""
+    """Survey of a line, with the runs and notes on the files."""
 
     survey: Survey
     runs: tuple[SurveyRun, ...]
@@ -244,10 +244,10 @@ def survey_files(
     reading: LogReading | None = None,
     columns: Mapping[str, str] | None = None,
 ) -> Surveyed:
-    """Survey a line from files of positions and logs of observations.
+    """Survey a line from position logs and observation logs.
 
-    Raise InputFileError if a file is missing, given twice, or not a log of positions or observations, or if a log lacks
-    navigation files. Raise MismatchError if the runs lie far apart, or have no line in common.
+    Raise InputFileError if a file is missing, occurs twice, or is neither a position log nor an observation log, or if
+    an observation log has no navigation file. Raise MismatchError if the runs are far apart or have no line in common.
     """
     for path in (*paths, *nav):
         if not path.is_file():
@@ -295,7 +295,7 @@ def survey_files(
 
 
 def _check_together(runs: Sequence[SurveyRun]) -> None:
-    """Raise MismatchError if a run lies farther than `ANOTHER_PLACE_M` from the first run."""
+    """Raise MismatchError if a run is farther than `ANOTHER_PLACE_M` from the first run."""
     places: list[Floats] = [np.nanmedian(run.ecef_m, axis=0) for run in runs]
     for run, place in zip(runs, places, strict=True):
         distance = float(np.linalg.norm(place - places[0]))
@@ -307,25 +307,24 @@ def _check_together(runs: Sequence[SurveyRun]) -> None:
             )
 
 
-#: Columns of ``train.parquet`` with measured properties of the line: chainage [m], gradient [permille] and curvature
-#: [1/m].
+#: Columns of ``train.parquet`` with measured line properties: chainage [m], gradient [permille], curvature [1/m].
 _COLUMNS: Final = ("measured_chainage_m", "measured_gradient_permille", "measured_curvature_1pm")
-#: Minimum change of gradient or curvature at a feature, in standard deviations.
+#: Minimum change of gradient or curvature that is a feature [standard deviations].
 _SIGMAS: Final = 5.0
 #: Minimum number of values for a mean.
 _LEAST_VALUES: Final = 3
-#: Number of iterations by which `centre_features` centres a window on a change.
+#: Number of iterations in which `centre_features` centres its window on a change.
 _CENTRED: Final = 5
-#: Time before and after a detected wheel slip within which measured values are omitted. The time before is needed
-#: because a slip affects the gradient before the slip is detected.
+#: Measured values are omitted within this time before and after a detected wheel slip. Values before the detection are
+#: omitted because the slip already affects the gradient.
 _BEFORE_SLIP: Final = np.timedelta64(1500, "ms")
 
 
 def read_measured(folder: Path) -> pl.DataFrame:
-    """Read the properties of the line that a run has measured, in order of chainage.
+    """Read the line properties that a run has measured (`_COLUMNS`), in order of chainage.
 
-    If the run has two antennas, the rows of the first antenna are returned. Raise InputFileError if the folder has no
-    results of the filter, or the run had no tachometer or no inertial unit.
+    Only the first antenna's rows are returned. Raise InputFileError if the folder has no filter results, or if the run
+    had no tachometer or no inertial unit.
     """
     path = folder / "train.parquet"
     with reading_table(path, "has no measured properties of the line ({}); give a folder written by railfix run"):
@@ -347,15 +346,15 @@ def read_measured(folder: Path) -> pl.DataFrame:
 class MeasuredFeature:
     """Feature detected in the combined values of all runs."""
 
-    feature: Feature  #: The feature, in which `arc_m` is a chainage.
-    places_m: Floats  #: Chainage of the feature in each run whose values alone suffice to detect it, shape (R,) [m].
-    map_m: float  #: Chainage of the same feature in the map [m]; NaN if the map has no such feature.
+    feature: Feature  #: Feature; its `arc_m` is a chainage.
+    places_m: Floats  #: Chainage of the feature in each run that alone detects it, shape (R,) [m].
+    map_m: float  #: Chainage of the feature in the map [m], NaN if the map lacks it.
 
 
 def find_features(runs: Sequence[pl.DataFrame], of_map: Sequence[Feature] = ()) -> list[MeasuredFeature]:
-    """Return the features detected in the combined values of all runs (`read_measured`), in order of chainage.
+    """Return the features detected in the combined values of all runs (see `read_measured`), in order of chainage.
 
-    `of_map` are the features of the map with which the detected features are compared.
+    `of_map` are the map features with which the detected features are compared.
     """
     alone = [_features(run) for run in runs]
     found = []
@@ -367,14 +366,14 @@ def find_features(runs: Sequence[pl.DataFrame], of_map: Sequence[Feature] = ()) 
 
 
 def _nearest(feature: Feature, others: Sequence[Feature]) -> float:
-    """Return the chainage of the nearest feature of the same quantity and sign of change [m]; NaN if none is near."""
+    """Return the chainage [m] of the nearest feature in `others` with the same quantity and sign of change, or NaN."""
     alike = [f.arc_m for f in others if f.quantity == feature.quantity and f.change * feature.change > 0.0]
     near = [at for at in alike if abs(at - feature.arc_m) < 2.0 * BASE_M]
     return min(near, key=lambda at: abs(at - feature.arc_m), default=float("nan"))
 
 
 def _features(rows: pl.DataFrame) -> list[Feature]:
-    """Return the features in rows ordered by chainage; each stretch with enough values is searched separately."""
+    """Return the features in rows ordered by chainage. Each section with enough values is searched separately."""
     at = rows[_COLUMNS[0]].to_numpy()
     grid = np.arange(np.ceil(at[0]), np.floor(at[-1]), STEP_M)
     first = np.searchsorted(at, grid - 0.5 * BASE_M)
@@ -395,7 +394,7 @@ def _features(rows: pl.DataFrame) -> list[Feature]:
 
 
 def centre_features(features: Sequence[Feature], series: LineSeries) -> list[Feature]:
-    """Return features, each moved to the centre of the change of gradient or curvature.
+    """Return the features, each moved to the centre of its change of gradient or curvature.
 
     On a long transition, noise shifts the detected position, but hardly affects the centre of the change.
     """
@@ -414,7 +413,7 @@ def centre_features(features: Sequence[Feature], series: LineSeries) -> list[Fea
 
 
 def _means(values: Floats, first: np.ndarray, last: np.ndarray) -> tuple[Floats, Floats]:
-    """Return the means of values from index `first` up to before `last`, and the standard deviations of the means."""
+    """Return the means of ``values[first:last]``, and the standard deviations of the means."""
     count = np.maximum(last - first, 1)
     middle = values - values.mean()
     sums, squares = (np.concatenate([[0.0], np.cumsum(each)]) for each in (middle, middle**2))

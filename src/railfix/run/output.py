@@ -1,8 +1,8 @@
 """Writing of output files under temporary names, which are moved to the output folder when all files are complete.
 
-An output never replaces an input. Staging folders are hidden and locked. If a process is killed, its staging folder
-remains, but the operating system releases the lock. A staging folder that is not locked therefore belongs to a process
-that has ended.
+An output never replaces an input. The files are first written to a hidden, locked staging folder. If a process is
+killed, its staging folder remains, but the operating system releases the lock. A staging folder that is not locked
+therefore belongs to a process that has ended.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ if TYPE_CHECKING:
 
 _PREFIX: Final = ".railfix-"
 _LOCK: Final = ".lock"
-#: Name of the folder inside a staging folder that has the complete files; a single rename creates it with all files.
+#: Folder with the complete files inside a staging folder. A single rename creates it with all files.
 READY: Final = "ready"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Staging:
-    """Hidden folder inside a results folder, and its lock file, which stays open and holds the process identifier."""
+    """Hidden folder inside a results folder, and its open lock file, which contains the process identifier."""
 
     path: Path
     lock: IO[str]
@@ -53,7 +53,7 @@ class Staging:
 
 
 def make_staging(folder: Path) -> Staging:
-    """Create a staging folder inside a folder, locked by this process; raise OSError if `folder` cannot be written."""
+    """Create a staging folder inside `folder`, locked by this process. Raise OSError if `folder` is not writable."""
     while True:
         name = folder / f"{_PREFIX}{secrets.token_hex(4)}"
         path, staging = name.with_name(name.name + _LOCK), None
@@ -62,7 +62,7 @@ def make_staging(folder: Path) -> Staging:
             staging = Staging(path=name, lock=lock)
             lock.write(f"{os.getpid()}\n")
             lock.flush()
-            # Another process may have removed the new file as a leftover before it was locked.
+            # Before the new lock file was locked, another process may have removed it as a remnant.
             if _try_lock(lock) and Path(lock.name).exists():
                 name.mkdir()
                 return staging
@@ -76,7 +76,7 @@ def make_staging(folder: Path) -> Staging:
 
 
 def clean_up(folder: Path) -> None:
-    """Remove the staging folders of killed processes; move the files of a complete staging folder to `folder` first.
+    """Remove the staging folders of killed processes; complete files in them are first moved to `folder`.
 
     Raise OutputError if another process is writing to the folder.
     """
@@ -88,7 +88,7 @@ def clean_up(folder: Path) -> None:
 
 
 def _release(lock: Path) -> None:
-    """Remove the lock file of a killed process and its staging folder; raise OutputError if the process is running."""
+    """Remove a killed process's lock file and staging folder. Raise OutputError if the process is still running."""
     try:
         file = lock.open("r+", encoding="ascii", errors="replace")
     except FileNotFoundError:
@@ -110,9 +110,9 @@ def _release(lock: Path) -> None:
 
 
 def move_in_place(ready: Path, folder: Path) -> dict[str, Path]:
-    """Move all files of the folder `ready` into `folder`, records (JSON) last, and return the new paths by name.
+    """Move all files in `ready` to `folder`, records (JSON) last. Return the new paths by name.
 
-    Records that will be replaced are removed first, so that a record is never next to the tables of another run.
+    Records that will be replaced are removed first, so that a record is never in a folder with another run's tables.
     """
     files = sorted(ready.iterdir(), key=lambda path: (path.suffix == ".json", path.name))
     for source in files:
@@ -123,7 +123,7 @@ def move_in_place(ready: Path, folder: Path) -> dict[str, Path]:
 
 
 def _try_lock(file: IO[str]) -> bool:
-    """Lock a file for this process and return whether this succeeded; False if another process has locked it."""
+    """Lock a file for this process. Return False if another process has locked it."""
     if sys.platform == "win32":
         import msvcrt
 
@@ -140,17 +140,17 @@ def _try_lock(file: IO[str]) -> bool:
     return True
 
 
-#: Rows per row group of a Parquet file; a group is assembled in memory.
+#: Rows per row group of a Parquet file. Each group is assembled in memory.
 _GROUP: Final = 30_000
 #: Interval at which a waiting caller checks whether the writer has failed [s].
 _LOOK_S: Final = 0.1
 
 
 class ParquetFile:
-    """Parquet file to which tables of one schema are appended; the memory used does not grow with the number of tables.
+    """Parquet file to which tables of one schema are appended. Memory use does not grow with the number of tables.
 
-    polars writes a file from one query. The source of the query runs in a thread and waits for each table that is
-    appended; at most one table is queued.
+    polars writes a file from a single query. A thread runs the query; its source waits for each appended table. At most
+    one table is queued.
     """
 
     def __init__(self, path: Path, schema: pl.Schema) -> None:
@@ -162,7 +162,7 @@ class ParquetFile:
         self._thread.start()
 
     def append(self, table: pl.DataFrame) -> None:
-        """Queue rows for writing; raise SchemaError, or an error that occurred while earlier rows were written."""
+        """Queue rows for writing. Raise SchemaError for other columns, and any error in the writing of earlier rows."""
         from polars.exceptions import SchemaError
 
         if table.schema != self._schema:
@@ -170,7 +170,7 @@ class ParquetFile:
         self._give(table)
 
     def end(self, metadata: Mapping[str, str] | None = None) -> None:
-        """Write the remaining rows and the footer with `metadata`; raise an error that occurred during writing."""
+        """Write the remaining rows, and the footer with `metadata`. Raise any error that occurred during writing."""
         self._metadata = dict(metadata or {})
         self._give(None)
         self._thread.join()
@@ -204,7 +204,7 @@ class ParquetFile:
 Overwrite = Literal["refuse", "replace"]
 #: Kind of a single output file, for `check_output_file`.
 FileKind = Literal["page", "csv", "pos", "picture", "png", "map", "any"]
-#: For each kind of file, its description, the endings of its name, and a hint on other formats.
+#: Description, name endings, and hint on other formats, by kind of file.
 _ENDINGS: Final[Mapping[str, tuple[str, tuple[str, ...], str]]] = {
     "page": ("an HTML page", (".html", ".htm"), "; for a PDF file, print the page in a browser"),
     "csv": ("a table in CSV", (".csv",), ""),
@@ -213,9 +213,9 @@ _ENDINGS: Final[Mapping[str, tuple[str, tuple[str, ...], str]]] = {
     "png": ("a picture in PNG", (".png",), ""),
     "map": ("a file for maps", (".kml", ".gpx", ".geojson", ".gpkg", ".parquet", ".mcap"), ""),
 }
-#: Format of times in CSV: ISO 8601 to the nanosecond without a time zone; the times are GPS time.
+#: Format of GPS times in CSV: ISO 8601 with nanoseconds, without a time zone.
 CSV_TIME: Final = "%Y-%m-%dT%H:%M:%S%.9f"
-#: Number of rows that `OutputFolder.change` transforms together.
+#: Number of rows that `OutputFolder.change` transforms at a time.
 _ROWS: Final = 50_000
 
 #: Number of attempts to create a folder while other runs create and remove its parent folders.
@@ -223,15 +223,15 @@ _ATTEMPTS: Final = 10
 
 
 class OutputFolder:
-    """Output folder of a command, which receives all files at once or none; it is created if it does not exist.
+    """Output folder of a command. It receives all files at once or none, and is created if it does not exist.
 
-    In the block of this context manager, files are written to a hidden staging folder, from which `commit` moves them
-    to the output folder. If the block ends with an error, the written files are removed, and the output folder is
-    removed, too, if it was created. Remains of a killed process are removed by the next `OutputFolder` at the same
-    path. With "replace", existing files of the same names are replaced by `commit`; `inputs` are never overwritten.
+    In the block of this context manager, files are written to a hidden staging folder; `commit` moves them to the
+    output folder. If the block ends with an error, the written files are removed, and so is the output folder if it was
+    created. Remains of a killed process are removed by the next `OutputFolder` at the same path. With "replace",
+    `commit` replaces existing files that have the same names. Files in `inputs` are never overwritten.
 
-    Raise OutputError if the folder cannot be created or written, is not empty (with "refuse"), is being written by
-    another process, or a file would overwrite an input.
+    Raise OutputError if the folder cannot be created or written, if it is not empty (with "refuse"), if another process
+    is writing to it, or if a file would overwrite an input.
     """
 
     def __init__(self, path: Path, *, overwrite: Overwrite = "refuse", inputs: Sequence[Path] = ()) -> None:
@@ -253,7 +253,7 @@ class OutputFolder:
                 raise
 
     def _make(self) -> None:
-        """Create the folder and its parents, which other runs may create or remove at the same time."""
+        """Create the folder and its parents. Other runs may create or remove the same folders at the same time."""
         for left in reversed(range(_ATTEMPTS)):
             try:
                 for folder in reversed([p for p in (self.path, *self.path.parents) if not p.exists()]):
@@ -289,13 +289,13 @@ class OutputFolder:
 
     @property
     def staging(self) -> Path:
-        """Path of the staging folder; only files registered by `stage` become results."""
+        """Path of the staging folder. Only files registered by `stage` become results."""
         return self._staging.path
 
     def stage(self, name: str) -> Path:
-        """Return the temporary path at which a result is to be written; `commit` moves it to the output folder.
+        """Return a temporary path for writing a result. `commit` moves the file to the output folder.
 
-        Raise OutputError if the file would overwrite an input, or a folder of that name exists.
+        Raise OutputError if the file would overwrite an input, or if a folder of the same name exists.
         """
         target = self.path / name
         check_not_input(target, self._inputs)
@@ -314,21 +314,21 @@ class OutputFolder:
             table.write_csv(self._csv[name], include_header=first, datetime_format=CSV_TIME)
 
     def append_parquet(self, name: str, table: pl.DataFrame) -> None:
-        """Append rows to a Parquet file; another thread writes them (`ParquetFile`)."""
+        """Append rows to a Parquet file, which another thread writes (`ParquetFile`)."""
         with _writing(self.path / name):
             if name not in self._parquet:
                 self._parquet[name] = ParquetFile(self.stage(name), table.schema)
             self._parquet[name].append(table)
 
     def append_rows(self, name: str, table: pl.DataFrame) -> None:
-        """Append rows to the Parquet file of a table, and rounded rows to its CSV file."""
+        """Append rows to a table: unrounded to its Parquet file, and rounded to its CSV file."""
         from railfix.pipeline.result_tables import round_floats
 
         self.append_parquet(f"{name}.parquet", table)
         self.append_csv(f"{name}.csv", round_floats(table))
 
     def end_parquet(self, metadata: Mapping[str, str] | None = None) -> None:
-        """Close all Parquet files, with `metadata` in each footer; `scan` can then read them."""
+        """Close all Parquet files, with `metadata` in each footer. `scan` can read only closed files."""
         while self._parquet:
             name, file = next(iter(self._parquet.items()))
             with _writing(self.path / name):
@@ -348,21 +348,21 @@ class OutputFolder:
                 self.append_rows(name, transform(before.slice(start, _ROWS).collect()))
 
     def scan(self, name: str) -> pl.LazyFrame:
-        """Return a lazy frame of a Parquet file after `end_parquet`."""
+        """Return a lazy frame of a Parquet file that `end_parquet` has closed."""
         import polars as pl
 
         return pl.scan_parquet(self.staging / name)
 
     def write_json(self, name: str, content: Mapping[str, Any]) -> None:
-        """Write a JSON file; NaN and infinities, which JSON lacks, are written as the texts of `finite_values`."""
+        """Write a JSON file. NaN and infinities, which JSON lacks, are written as text (`finite_values`)."""
         with _writing(self.path / name):
             text = json.dumps(finite_values(content), indent=2, ensure_ascii=False, allow_nan=False)
             self.stage(name).write_text(text + "\n", encoding="utf-8")
 
     def commit(self, metadata: Mapping[str, str] | None = None) -> dict[str, Path]:
-        """Move all registered files to the output folder and return their paths by name.
+        """Move all registered files to the output folder, and return their paths by name.
 
-        `metadata` is written to the footer of each Parquet file that has not ended.
+        `metadata` is written to the footer of each Parquet file that is not yet closed.
         """
         staging = self._staging.path
         with _writing(self.path):
@@ -378,10 +378,10 @@ class OutputFolder:
 
 
 def check_folder(path: Path, *, overwrite: Overwrite) -> None:
-    """Remove the remains of killed processes from a results folder, and raise OutputError if it must not be written.
+    """Remove the remains of killed processes from a results folder. Raise OutputError if it must not be written.
 
-    The folder must not be written if the path is a file, if another process is writing to it, or, with "refuse", if it
-    is not empty.
+    A folder must not be written if the path is a file, if another process is writing to the folder, or, with "refuse",
+    if the folder is not empty.
     """
     with _writing(path):
         if path.exists() and not path.is_dir():
@@ -402,8 +402,8 @@ def check_not_input(target: Path, inputs: Sequence[Path]) -> None:
 def check_output_file(target: Path, *, overwrite: Overwrite, inputs: Sequence[Path], kind: FileKind = "any") -> None:
     """Raise OutputError if an output file cannot or must not be written.
 
-    A file cannot or must not be written if its folder does not exist or is not writable, if the file is a folder or one
-    of `inputs`, if it exists (with "refuse"), or if its name lacks the ending of its kind.
+    The error is raised if the folder of the file does not exist or is not writable, if the path is a folder or one of
+    `inputs`, if the file exists (with "refuse"), or if its name has no ending of its kind.
     """
     with _writing(target):
         check_not_input(target, inputs)
@@ -436,7 +436,7 @@ def _writing(path: Path) -> Iterator[None]:
 
 
 def finite_values(value: Any) -> Any:
-    """Return nested plain values with NaN and infinities replaced by the texts "nan", "inf" and "-inf"."""
+    """Return nested plain values, with NaN and infinities replaced by the texts "nan", "inf" and "-inf"."""
     if isinstance(value, Mapping):
         return {key: finite_values(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -1,9 +1,9 @@
-"""Cache of prepared lines on disk: tracks as read from their files, and antenna trajectories.
+"""Disk cache of prepared lines: tracks that were read from files, and antenna trajectories.
 
 Reading a line of 2000 km and computing the trajectories of two antennas takes seconds. The result depends only on the
 files, the settings and the version of railfix. Long lines are therefore stored in a cache folder, which may be deleted
-at any time. This is the platform's cache folder (``~/.cache/railfix`` on Linux), or the folder named by the environment
-variable `VARIABLE`.
+at any time. It is the platform's cache folder (``~/.cache/railfix`` on Linux), or the folder that the environment
+variable `VARIABLE` specifies.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from railfix.track.trajectory import Trajectory
 VARIABLE: Final = "RAILFIX_CACHE_DIR"
 #: Minimum number of points of a cached line. 5000 points with two antennas take 0.11 s to prepare and 0.01 s to load.
 LEAST_POINTS: Final = 2_000
-#: Maximum number of cache entries; the oldest are deleted.
+#: Maximum number of cache entries; the oldest entries beyond it are deleted.
 MOST_ENTRIES: Final = 48
-#: Attributes that are computed from the points of a trajectory and cached with the points.
+#: Trajectory attributes that are computed from the points, and cached with them.
 _DERIVED: Final = ("up", "across")
-#: Exceptions raised when a damaged cache file is read.
+#: Exceptions that the reading of a damaged cache file may raise.
 _DAMAGE: Final = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error)
 
 
@@ -52,9 +52,9 @@ def cache_folder() -> Path:
 
 
 class PreparedLines:
-    """Reader and writer of the cache; `notes` collects messages on damaged files and files that cannot be written.
+    """Reader and writer of the cache. `notes` collects messages on damaged files and unwritable files.
 
-    With ``use=False`` nothing is read or written.
+    With ``use=False``, nothing is read or written.
     """
 
     def __init__(self, *, use: bool = True) -> None:
@@ -62,7 +62,7 @@ class PreparedLines:
         self._folder = cache_folder() if use else None
 
     def track(self, key: str) -> Track | None:
-        """Return the track cached under a key (`compute_key`); None if the cache does not have it."""
+        """Return the track cached under a key (`compute_key`), or None if it is not in the cache."""
         found = self._load(key)
         if found is None:
             return None
@@ -79,7 +79,7 @@ class PreparedLines:
             self._keep(key, {**plain, "provenance": asdict(track.provenance)}, arrays)
 
     def path(self, key: str) -> Trajectory | None:
-        """Return the trajectory cached under a key (`compute_key`); None if the cache does not have it."""
+        """Return the trajectory cached under a key (`compute_key`), or None if it is not in the cache."""
         found = self._load(key)
         if found is None:
             return None
@@ -148,7 +148,7 @@ def compute_key(kind: str, *parts: object) -> str:
 
 @cache
 def _code() -> list[tuple[str, int, int]]:
-    """Return name, size and modification time of each source file that affects a cached line, for the cache key."""
+    """Return name, size and modification time of each source file on which cached lines depend."""
     files = sorted(Path(railfix.track.__file__).parent.glob("*.py"))
     return [(file.name, (state := file.stat()).st_size, state.st_mtime_ns) for file in files]
 
@@ -160,7 +160,7 @@ def track_key(track: Track) -> str:
 
 
 def _parts(value: Track | Trajectory) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Return the fields of an object that are not arrays, and the array fields; both exclude the provenance."""
+    """Return the fields of an object that are not arrays, and the fields that are. The provenance is in neither."""
     values = {item.name: getattr(value, item.name) for item in fields(value) if item.name != "provenance"}
     arrays = {name: array for name, array in values.items() if isinstance(array, np.ndarray)}
     return {name: v for name, v in values.items() if name not in arrays}, arrays

@@ -1,4 +1,4 @@
-"""Set up the epoch processor of a run with the files named by its settings, and read the log of a base station."""
+"""Set up the epoch processor of a run with the files that the settings name, and read a base-station log."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ from railfix.track.trajectory import Trajectory
 
 
 def with_measured_priors(config: Config) -> Config:
-    """Return settings completed by their error model: fault priors, and stretches of line without a protection level.
+    """Return settings with the fault priors, and the line sections without a protection level, of their error model.
 
-    The settings remain unchanged if they have no error model, if a fault prior is given explicitly, or if the error
-    model has no bounds of fault priors. Stretches without a protection level that are given explicitly are kept.
+    The settings remain unchanged if they have no error model, if they specify a fault prior, or if the error model has
+    no bounds of fault priors. Sections without a protection level that the settings specify are kept.
     """
     given = config.risk.model_fields_set & {"local_prior", "side_prior", "priors"}
     if config.error_model is None or given:
@@ -47,12 +47,12 @@ def with_measured_priors(config: Config) -> Config:
 
 
 def sbas_corrections(config: Config) -> SbasState | None:
-    """Return the SBAS corrections of recorded messages, or the state before the first message; None without SBAS.
+    """Return the SBAS corrections of recorded messages or the state before the first message, or None without SBAS.
 
-    The settings name the files with the recorded messages; with ``sbas = "stream"``, messages arrive during the run. If
-    the settings request the best GEO, it is chosen from the recorded messages. Raise InputFileError if a file is
-    missing or malformed. Raise SettingsError if there is no message of the requested GEO, or if the best GEO is
-    requested for a stream.
+    The settings name the files with the recorded messages. With ``sbas = "stream"``, messages arrive during the run,
+    and the state before the first message is returned. With ``sbas_prn = "best"``, the GEO is selected from the
+    recorded messages. Raise InputFileError if a file is missing or malformed. Raise SettingsError if there is no
+    message of the requested GEO, or if the best GEO is requested for a stream.
     """
     if not config.sbas:
         return None
@@ -80,13 +80,13 @@ def make_processor(
     balises: ListedBalises | None = None,
     base_ecef_m: Floats | Literal["stream"] | None = None,
 ) -> EpochProcessor:
-    """Return a processor with all navigation records and the contents of the files that the settings name.
+    """Return a processor with all navigation records, and with the content of the files that the settings name.
 
-    `trajectories` has the trajectory of each antenna. `track` is required for positioning by features of the line.
-    `units` are the surveyed ground units of two-way ranges, `balises` the positions of the balises. `base_ecef_m` is
-    the position of a base station [m]; with "stream" it is taken from the headers of the station's observations. Raise
-    InputFileError if a file named by the settings is missing or malformed. Raise SettingsError if SBAS is combined with
-    precise orbits, or there is no SBAS message of the requested GEO satellite.
+    `trajectories` has the trajectory of each antenna. `track` is required for positioning by line features. `units` are
+    the surveyed ground units of two-way ranging, and `balises` the balise positions. `base_ecef_m` is the base-station
+    position [m]; with "stream", it is taken from the headers of the station's observations. Raise InputFileError if a
+    file that the settings name is missing or malformed. Raise SettingsError if SBAS is combined with precise orbits, or
+    if there is no SBAS message of the requested GEO.
     """
     if config.sbas and navigation.precise is not None:
         raise SettingsError("SBAS corrects broadcast records, not precise orbits; use either --sbas or --sp3")
@@ -105,14 +105,14 @@ def make_processor(
     )
 
 
-#: Largest time by which the base station's time tags may be later than the train's time tags for the same instant.
+#: Base-station time tags up to this much later than the train's are assumed to be of the same instant.
 _SAME_INSTANT = np.timedelta64(50, "ms")
 
 
 def parse_position(text: str, option: str) -> Floats:
     """Parse a position LAT,LON,HEIGHT [deg, deg, m] and return it in ECEF, shape (3,) [m].
 
-    Raise SettingsError if the text is not such a position; `option` names the option in the message.
+    Raise SettingsError if the text is not such a position. The message names the option `option`.
     """
     try:
         latitude, longitude, height = (float(part) for part in text.split(","))
@@ -124,9 +124,9 @@ def parse_position(text: str, option: str) -> Floats:
 
 
 class BaseLog:
-    """Log of a base station at the position `place` (LAT,LON,HEIGHT), or else at the position in the header.
+    """Log of a base station. Its position is `place` (LAT,LON,HEIGHT), or if None, the position in the log header.
 
-    Raise InputFileError if the log has no epoch, or neither `place` nor the header gives the position.
+    Raise InputFileError if the log has no epoch, or if neither `place` nor the header states the position.
     """
 
     def __init__(self, log: Log, place: str | None) -> None:
@@ -141,7 +141,7 @@ class BaseLog:
             raise InputFileError(log.paths[0], "its header has no position; give the station's position (--base-place)")
 
     def until(self, time: np.datetime64) -> Observations | None:
-        """Return the epochs up to a time that have not been returned before; None if there are none."""
+        """Return the epochs up to `time` that have not been returned before, or None if there are none."""
         parts = list(self._until(time + _SAME_INSTANT))
         return concatenate(parts) if parts else None
 
@@ -160,13 +160,13 @@ class BaseLog:
 
 
 def check_base_place(base: object, place: str | None) -> None:
-    """Raise SettingsError if the position of a base station is given without its observations."""
+    """Raise SettingsError if a base-station position is specified without the station's observations."""
     if not base and place is not None:
         raise SettingsError("--base-place is given without --base; give the observations of the base station, too")
 
 
 def base_log(paths: tuple[Path, ...], options: RunOptions) -> BaseLog | None:
-    """Open the log of a base station; None without files."""
+    """Open the log of a base station. Return None if there are no files."""
     check_base_place(paths, options.base_place)
     if not paths:
         return None

@@ -1,4 +1,4 @@
-"""Record of a run (``run.json``) with inputs, settings and results, and tables made from a record."""
+"""Record of a run (``run.json``) with inputs, settings and results, and tables that summarise a record."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ from railfix.tracking import TrackStatus
 PACKAGES: Final = ("numpy", "scipy", "polars", "pyproj", "pydantic", "hatanaka", "georinex", "japan-geoid")
 
 
-#: Limits [m]; for each, the record has the number of the filter's protection levels that do not exceed the limit.
+#: Limits on the protection level [m]. The record states how many of the filter's levels are within each limit.
 WITHIN_M: Final = (20, 50)
 #: Statistics of an antenna without rows in the tables.
 NO_FIGURES: Final = {"along_sigma_m": None, "chainage_m": None, "protection_level": None, "filter": None}
 
 
 def compute_figures(folder: OutputFolder, tally: Tally, config: Config) -> dict[str, dict[str, Any]]:
-    """Return statistics of each antenna from the written tables, with lengths in [m]; None for missing statistics.
+    """Return statistics of each antenna, computed from the written tables. Lengths are in metres.
 
-    The statistics describe the sigma along the line, the chainage, the finite protection levels (with epochs by
-    status), and the filter (with epochs by status, and the number of levels within each limit of `WITHIN_M`).
+    There are statistics of the sigma along the line, the chainage, the finite protection levels (with epochs by
+    status), and the filter (with epochs by status, and levels within each limit of `WITHIN_M`); None if missing.
     """
     return {
         name: {
@@ -100,7 +100,7 @@ def _rows(folder: OutputFolder, table: str, antenna: str) -> pl.LazyFrame:
 
 
 def _figures(rows: pl.LazyFrame, figures: Mapping[str, pl.Expr]) -> dict[str, Any]:
-    """Return the values of aggregating expressions over all rows."""
+    """Return the values of aggregating expressions over all rows, by name."""
     return rows.select(**figures).collect().row(0, named=True)
 
 
@@ -110,9 +110,9 @@ class RunProvenance:
 
     files: Sequence[Mapping[str, Any]]  #: Input files with size and hash (`fingerprint`).
     packages: Mapping[str, str]  #: Result of `package_versions`.
-    asked: Mapping[str, Any]  #: Settings that were given explicitly.
+    asked: Mapping[str, Any]  #: Settings that the user specified.
     config: Config  #: All settings that were used.
-    options: RunOptions  #: Options that do not change the positions.
+    options: RunOptions  #: Options of the run.
     line: Mapping[str, Any]  #: Properties of the track map, the vehicle and the trajectories.
     navigation: Navigation
 
@@ -124,7 +124,7 @@ def run_record(
     figures: Mapping[str, Mapping[str, Any]],
     wall_s: float,
 ) -> dict[str, Any]:
-    """Return the content of ``run.json`` as plain values; `figures` are the result of `compute_figures`."""
+    """Return the content of ``run.json`` as plain values. `figures` is the result of `compute_figures`."""
     navigation, config = made_from.navigation, made_from.config
     observed = sum(antenna.observed for antenna in tally.antennas.values())
     ok = sum(antenna.status[Status.OK.text] for antenna in tally.antennas.values())
@@ -164,7 +164,7 @@ def run_record(
 
 
 def package_versions() -> dict[str, str]:
-    """Return the version of each of `PACKAGES`; "absent" if a package is not installed."""
+    """Return the version of each package in `PACKAGES`, or "absent" if it is not installed."""
     versions = {}
     for name in PACKAGES:
         try:
@@ -174,19 +174,19 @@ def package_versions() -> dict[str, str]:
     return versions
 
 
-#: Settings, by group and name, that records of earlier versions contain although they never affected a result.
+#: Settings, by group and name, in records of earlier versions, which never affected a result.
 WITHOUT_EFFECT: Final = (("section", "predicted_sigmas"),)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunRecord:
-    """Record of a run, the file ``run.json`` in a results folder."""
+    """Record of a run, read from the file ``run.json`` in a results folder."""
 
     path: Path  #: Results folder.
     record: Mapping[str, Any]  #: Content of ``run.json``.
 
     def part(self, name: str) -> dict[str, Any]:
-        """Return a table of the record; raise InputFileError if it is missing or not a table."""
+        """Return a table of the record. Raise InputFileError if the entry is missing or is no table."""
         table = self.record.get(name)
         if not isinstance(table, dict):
             raise InputFileError(self.path / "run.json", f"has no table {name}; repeat the run with this version")
@@ -194,9 +194,9 @@ class RunRecord:
 
     @cached_property
     def config(self) -> Config:
-        """Settings that were used, with the present paths of their files, without the settings `WITHOUT_EFFECT`.
+        """Settings that were used, except `WITHOUT_EFFECT`, with the present paths of the files that they name.
 
-        Raise InputFileError if the record lacks the settings, or they are not settings of this version.
+        Raise InputFileError if the record has no settings, or if they are not settings of this version.
         """
         used = dict(self.part("settings_used"))
         for group, name in WITHOUT_EFFECT:
@@ -209,7 +209,7 @@ class RunRecord:
 
     @cached_property
     def inputs(self) -> RunInputs:
-        """Input files with their present paths; raise InputFileError if they do not fit this version."""
+        """Input files with their present paths. Raise InputFileError if the inputs do not fit this version."""
         kinds = dict.fromkeys(str(entry["input"]) for entry in self.entries)
         several = {name for name, field in RunInputs.model_fields.items() if field.annotation == tuple[Path, ...]}
         values = {
@@ -219,7 +219,7 @@ class RunRecord:
 
     @cached_property
     def options(self) -> RunOptions:
-        """Options that were used; raise InputFileError if they do not fit this version."""
+        """Options that were used. Raise InputFileError if the options do not fit this version."""
         return self._this_version(lambda: validate(RunOptions, self.part("options"), source="options"))
 
     def _this_version(self, read: Callable[[], Model]) -> Model:
@@ -232,7 +232,7 @@ class RunRecord:
             ) from None
 
     def check_inputs(self) -> None:
-        """Raise InputFileError if an input file is missing, or MismatchError if an input has changed since the run."""
+        """Raise InputFileError if an input file is missing, and MismatchError if an input has changed since the run."""
         self.inputs.check()
         for entry in self.entries:
             path = input_path(entry, self.path)
@@ -247,7 +247,7 @@ class RunRecord:
 
     @property
     def entries(self) -> list[Mapping[str, Any]]:
-        """Recorded input files with kind, path and SHA-256; raise InputFileError if the record has no such list."""
+        """Recorded input files with kind, path and SHA-256. Raise InputFileError if the record has no such list."""
         entries = self.record.get("inputs", [])
         complete = isinstance(entries, list) and all(
             isinstance(entry, dict) and {"input", "path", "sha256"} <= set(entry) for entry in entries
@@ -260,7 +260,7 @@ class RunRecord:
 
 
 def read_record(folder: Path) -> RunRecord:
-    """Read the record of a run from a results folder; raise InputFileError if ``run.json`` is missing or malformed."""
+    """Read the record in a results folder. Raise InputFileError if ``run.json`` is missing or malformed."""
     if not folder.is_dir():
         problem = "is a file" if folder.exists() else "there is no such folder"
         raise InputFileError(folder, f"{problem}, expected the folder that railfix run wrote; give that folder")
@@ -271,7 +271,7 @@ def read_record(folder: Path) -> RunRecord:
 
 
 def read_parquet(path: Path, *, columns: cs.Selector | None = None) -> pl.DataFrame:
-    """Read all or the selected columns of a table that a run wrote.
+    """Read a table that a run wrote: the columns `columns`, or all columns if None.
 
     Raise InputFileError if the file is not a Parquet file.
     """
@@ -282,23 +282,23 @@ def read_parquet(path: Path, *, columns: cs.Selector | None = None) -> pl.DataFr
 
 
 Facts = Mapping[str, Any]
-#: Keys of the statistics of the standard deviation in the record, by their labels in the tables.
+#: Record keys of the standard deviation statistics, by their labels in the tables.
 _OF_SIGMA: Final = {"p50": "p50_m", "p95": "p95_m", "largest": "max_m"}
-#: Keys of the statistics of the protection level in the record, by their labels in the tables.
+#: Record keys of the protection level statistics, by their labels in the tables.
 _OF_LEVEL: Final = {"p50": "p50_m", "p95": "p95_m"}
 
 
 def level_basis(record: Facts) -> str:
-    """Return "protection" if the fault priors of the run are measured, otherwise "indicative protection"."""
+    """Return "protection" if the run's fault priors are measured, or "indicative protection" if they are not."""
     risk = (record.get("settings_used") or {}).get("risk") or {}
     return "protection" if risk.get("priors") == "measured" else "indicative protection"
 
 
 def budget_tables(antennas: Mapping[str, Facts], basis: str) -> list[Table]:
-    """Return tables of filter epochs by status, single epochs by status, and pseudoranges by rejection reason.
+    """Return three tables: filter epochs by status, single epochs by status, and pseudoranges by rejection reason.
 
-    `antennas` has the facts of each antenna from ``run.json``, `basis` the result of `level_basis`. The first table is
-    absent if the filter was off. Fields missing in a record of an earlier version are shown as a dash.
+    `antennas` has the part of each antenna in ``run.json``, and `basis` is the result of `level_basis`. The first table
+    is absent if the filter was off. Fields that a record of an earlier version lacks are shown as a dash.
     """
     filtered = {name: facts["filter"] for name, facts in antennas.items() if facts.get("filter")}
     caption = "Single epochs (positions.csv)" if filtered else "Epochs by status"
@@ -355,7 +355,7 @@ def _epochs_table(antennas: Mapping[str, Facts], basis: str, caption: str) -> Ta
 
 
 def _rows_of_few(antennas: Sequence[Facts]) -> Iterator[list[str]]:
-    """Yield a row for each reason: numbers of epochs with too few satellites due to the reason, and due to it alone."""
+    """Yield, for each rejection reason, the numbers of epochs with too few satellites due to it, and to it alone."""
     first = [Counter(facts.get("too_few_satellites_by_first_reason") or {}) for facts in antennas]
     alone = [Counter(facts.get("too_few_satellites_by_one_reason_alone") or {}) for facts in antennas]
     for reason in dict.fromkeys(name for counts in first for name, _ in counts.most_common()):
@@ -391,7 +391,7 @@ def _ratio(part: float, whole: float) -> float | None:
 
 
 def _metres(what: str, found: Sequence[Facts | None], fields: Mapping[str, str]) -> Iterator[list[str]]:
-    """Yield a row of lengths [m] for each field of the antennas' figures, with a dash for a missing figure."""
+    """Yield a row of lengths [m] for each field, with one column per antenna. Missing lengths are shown as a dash."""
     for label, field in fields.items():
         yield [f"{what}, {label}", *(number(None if each is None else each[field], 2, " m") for each in found)]
 

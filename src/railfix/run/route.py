@@ -1,7 +1,7 @@
-"""Route of a log through a network of tracks, found from the log itself, with neighbouring tracks as hypotheses.
+"""Route of a log through a network of tracks, found from the log itself, and probabilities of other tracks.
 
-One conventional position per second is matched to the network (`railfix.track.network_match`). The most probable
-sequence of tracks is the route on which positions are computed; the probabilities of all other tracks are kept.
+One conventional position per second is matched to the network (`railfix.track.network_match`). Positions are computed
+on the most probable sequence of tracks, the route. The probabilities of all other tracks are reported.
 """
 
 from __future__ import annotations
@@ -35,25 +35,25 @@ from railfix.track.network_route import find_route, left_out_note
 
 #: Interval of the matched positions [s].
 _INTERVAL_S: Final = 1.0
-#: Distance along the route within which a track of the route counts as near a position on the route [m].
+#: Largest distance along the route from a position to a track of the route that is near the position [m].
 _REACH_M: Final = 50.0
-#: Bound on the relative difference between lengths in plan and lengths along the line; `_REACH_M` is increased by this
-#: fraction of the length of the route.
+#: Assumed bound on the relative difference between lengths in plan and lengths along the line. `_REACH_M` is increased
+#: by this fraction of the route length.
 _LENGTHS_DIFFER: Final = 1e-3
 #: Minimum probability at which a track outside the route is written to the table.
 _LEAST_WRITTEN: Final = 1e-4
 #: Minimum probability at which a track outside the route is reported in the notes.
 _LEAST_NAMED: Final = 0.01
-#: Number of alternatives reported in the notes; all are in ``run.json``.
+#: Maximum number of alternatives reported in the notes; all are in ``run.json``.
 _NAMED: Final = 8
-#: Largest gap between positions of one `Alternative` [s].
+#: Largest gap between consecutive positions of one `Alternative` [s].
 _TOGETHER_S: Final = 60.0
-#: Probability above which the log indicates an unmapped track: twice the prior.
+#: Probability above which the log is taken to indicate an unmapped track: twice the prior.
 _UNMAPPED_LIMIT: Final = 2.0 * UNMAPPED_PRIOR
-#: Name of an unmapped track.
+#: Name that results use for an unmapped track.
 NONE: Final = "none"
 
-#: Additional columns of positions on a network.
+#: Columns that position tables of a run on a network have in addition.
 ON_TRACK_COLUMNS: Final[dict[str, str]] = {
     "track": "track of the network on which the position lies; it is part of the route found from the log",
     "track_chainage_m": "distance in plan along `track` from the first point of the track to the antenna",
@@ -82,10 +82,10 @@ TRACK_COLUMNS: Final[dict[str, str]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Alternative:
-    """Stretch of a log on which a track outside the route is possible."""
+    """Part of a log in which the train may have been on a track outside the route."""
 
     track: str  #: Name of the alternative track.
-    instead_of: str  #: Name of the track of the route on this stretch.
+    instead_of: str  #: Name of the route's track in this part.
     first: np.datetime64  #: First epoch, GPS time.
     last: np.datetime64
     probability: float  #: Largest probability of the alternative track.
@@ -112,15 +112,15 @@ class Alternative:
 
 @dataclass(frozen=True, kw_only=True)
 class RouteOfLog:
-    """Route of a log through a network, with the probability of every track near it."""
+    """Route of a log through a network, with the probabilities of all tracks near the log's positions."""
 
     network: Network
-    tracks: tuple[int, ...]  #: Tracks of the route, in order.
-    #: Tracks of the most probable sequence that cannot be joined to the route, because the train reversed on them.
+    tracks: tuple[int, ...]  #: Indices of the route's tracks, in order.
+    #: Tracks of the most probable sequence that are not part of the route, because the train reversed on them.
     left_out: tuple[int, ...]
     log: PlanLog  #: Matched positions in the frame of the network.
-    matched: Matched  #: Tracks near each matched position with their probabilities.
-    time: np.datetime64  #: Epoch of the coordinates of positions, for the transformation to the frame of the network.
+    matched: Matched  #: Tracks near each matched position, with their probabilities.
+    time: np.datetime64  #: Epoch at which positions are transformed to the frame of the network.
     reading: TrackReading  #: Options with which the network was read.
 
     @cached_property
@@ -131,11 +131,11 @@ class RouteOfLog:
     def is_uncertain(self, time: Datetimes, chainage_m: Floats, *, risk: float) -> Masks:
         """Return whether the probability that the train is not on the route exceeds `risk` at each time, shape (T,).
 
-        The probability of the route is the sum over the tracks of the route within `_REACH_M` of the chainage. A more
-        distant part of the route that runs parallel is a wrong track at this chainage. Of the values at the matched
-        positions before and after the time, the smaller is used, because the train may change tracks between these
-        positions. The probability of an unmapped track counts only in excess of `_UNMAPPED_LIMIT`, because protection
-        levels include the rest (`with_unmapped`).
+        The probability of the route is the sum over its tracks within `_REACH_M` of the chainage. More distant tracks
+        of the route may be parallel to this point, and then are wrong tracks. The probability is computed at the
+        matched positions before and after the time. The smaller value is used, because the train may change tracks
+        between these positions. Up to `_UNMAPPED_LIMIT`, the probability of an unmapped track is no reason for
+        uncertainty, because protection levels include it (`with_unmapped`).
         """
         after = np.searchsorted(self.log.time, time)
         last = len(self.log.time) - 1
@@ -146,9 +146,9 @@ class RouteOfLog:
         return np.asarray(np.fmin(*known) < 1.0 - risk)
 
     def _share_at(self, epoch: Indices, chainage_m: Floats) -> Floats:
-        """Return the probability of the route's tracks near given chainages [m], shape (T,).
+        """Return the total probability of the route's tracks near each chainage [m], shape (T,).
 
-        `epoch` has the index of the matched position for each chainage. If a chainage is NaN, all tracks of the route
+        `epoch` is the index of the matched position for each chainage. If a chainage is NaN, all tracks of the route
         are included.
         """
         lengths = self.network.length_m[list(self.tracks)]
@@ -166,10 +166,10 @@ class RouteOfLog:
         return np.asarray(np.clip(1.0 - self.matched.probabilities.sum(axis=1), 0.0, 1.0))
 
     def with_unmapped(self, config: Config) -> Config:
-        """Return settings in which the prior of a wrong map is at least the probability of an unmapped track.
+        """Return the settings with the priors of a wrong map raised to at least the probability of an unmapped track.
 
-        The largest probability in the log is used, limited to `_UNMAPPED_LIMIT`. Beyond this limit no protection level
-        is computed (`is_uncertain`).
+        The largest probability in the log is used, but at most `_UNMAPPED_LIMIT`. Above this limit, protection levels
+        are infinite (`is_uncertain`).
         """
         share = float(np.clip(self.unmapped.max(), 0.0, _UNMAPPED_LIMIT))
         limits, risk, araim = config.tracking, config.risk, config.araim
@@ -185,7 +185,7 @@ class RouteOfLog:
 
     @cached_property
     def alternatives(self) -> tuple[Alternative, ...]:
-        """Stretches on which a track outside the route has a probability of at least 1 %, the most probable first."""
+        """Parts of the log in which a track outside the route has at least 1 % probability, most probable first."""
         names = (*self.network.names, NONE)
         beside = np.where(self._on_route > 0.0, -1, self.matched.candidates.track)
         known, found = np.flatnonzero(np.isin(self.matched.track, self.tracks)), []
@@ -211,7 +211,7 @@ class RouteOfLog:
 
     @property
     def names(self) -> list[str]:
-        """Names of the tracks of the route, in order."""
+        """Names of the route's tracks, in order."""
         return [self.network.names[k] for k in self.tracks]
 
     @property
@@ -241,10 +241,10 @@ class RouteOfLog:
         }
 
     def on_tracks(self, table: pl.DataFrame, line: Track) -> tuple[pl.DataFrame, pl.DataFrame]:
-        """Return a table of positions with `ON_TRACK_COLUMNS` added, and a table of `TRACK_COLUMNS`.
+        """Return a table of positions with `ON_TRACK_COLUMNS` added, and a table with `TRACK_COLUMNS`.
 
-        The second table has one row per position and track near it; epochs without a position have no rows. `line` is
-        the track map of the route, whose sections are the tracks of the route.
+        The second table has one row for each position and each track near the position. Epochs without a position have
+        no rows. `line` is the track map of the route; its sections are the tracks of the route.
         """
         chainage = table["chainage_m"].to_numpy()
         ecef = table.select("x_m", "y_m", "z_m").to_numpy()
@@ -292,10 +292,9 @@ class RouteOfLog:
         return positions, long[order]
 
     def _unconstrained(self, epoch: Indices, track: Indices) -> tuple[pl.Series, pl.Series]:
-        """Return the offsets and heights [m] of the matched positions `epoch` relative to the tracks `track`, shape
-        (n,).
+        """Return the offsets and heights [m] of matched positions relative to tracks, shape (n,) each.
 
-        Both arguments are indices. A value is null if the track is not among the candidates of the position.
+        `epoch` and `track` are indices. A value is null if the track is not among the position's candidate tracks.
         """
         near = self.matched.candidates
         same = (near.track[epoch] == track[:, None]) & (track >= 0)[:, None]
@@ -315,29 +314,29 @@ class RouteOfLog:
 class BaseObservations(Protocol):
     """Observations of a base station in order of time (`railfix.run.processor_setup.BaseLog`)."""
 
-    ecef_m: Floats  #: Position of the station, ECEF, shape (3,) [m].
+    ecef_m: Floats  #: Station position, ECEF, shape (3,) [m].
 
     def until(self, time: np.datetime64) -> Observations | None:
-        """Return the epochs up to a time that have not been returned before; None if there are none."""
+        """Return the epochs up to `time` that have not been returned before, or None if there are none."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LogPositions:
-    """Conventional positions of a log once per second, from which the route through a network is found."""
+    """Conventional positions of a log, one per second, from which the route through a network is found."""
 
     path: str  #: Name of the log in messages.
-    parts: Callable[[], Iterable[Observations]]  #: Returns the pieces of the log in order of time.
+    parts: Callable[[], Iterable[Observations]]  #: Function that returns the log in pieces, in order of time.
     navigation: Navigation
     config: Config
-    time: np.datetime64 | None  #: Epoch of the transformation between frames; None without a navigation record.
+    time: np.datetime64 | None  #: Epoch at which positions are transformed to the map frame, or None if unknown.
     reading: TrackReading
-    antenna_up_m: float | None = None  #: Height of the antenna above the rails [m]; None if no vehicle is given.
-    #: Opens the log of the base station; returns None if there is no base station.
+    antenna_up_m: float | None = None  #: Antenna height above the rails [m]; None without a vehicle file.
+    #: Function that opens the base-station log; it returns None if there is no base station.
     open_base: Callable[[], BaseObservations | None] = lambda: None
 
     @cached_property
     def positions(self) -> PositionLog:
-        """Positions with quality 5 (single), or 4 (DGPS) with a base station.
+        """Positions of the log, with quality 5 (single), or with quality 4 (DGPS) if there is a base station.
 
         Raise NoPositionError if the log has no position.
         """

@@ -1,6 +1,6 @@
-"""Checks of on-board sensors against satellite positions and speeds: signs, units, axes, time tags, wheel diameter.
+"""Checks of on-board sensors against satellite positions and speeds: sign, unit, axes, time tags, scale.
 
-Signs are checked against single-epoch positions, because speeds of the filter depend on the sensors.
+Signs are checked against single-epoch positions, because the filter's speeds depend on the sensors.
 """
 
 from __future__ import annotations
@@ -23,35 +23,35 @@ from railfix.pipeline.sensor_epochs import SensorLimits, ranging_lever_m
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Line
 
-#: Length of the cells of time over which positions are averaged [s].
+#: Length of the time cells over which positions are averaged [s].
 _CELL_S: Final = 4.0
-#: Minimum speed for a check of signs [m/s].
+#: Minimum speed at which signs are checked [m/s].
 _MOVING_MPS: Final = 1.0
 #: Minimum number of cells for a check.
 _LEAST_CELLS: Final = 15
-#: Minimum variation of the expected force for a comparison [m/s2].
+#: Minimum rms variation of the expected force for a comparison [m/s2].
 _LEAST_FORCE_MPS2: Final = 0.08
-#: Minimum variation of the expected speed for a comparison [m/s].
+#: Minimum rms variation of the expected speed for a comparison [m/s].
 _LEAST_SPEED_MPS: Final = 1.0
-#: Minimum variation of the expected turn rate for a comparison [rad/s].
+#: Minimum rms of the expected turn rate for a comparison [rad/s].
 _LEAST_RATE_RADPS: Final = 0.003
-#: Slope of measured over expected values below which the sign of a sensor is reversed.
+#: Slope of measured over expected values below which a sensor's sign is taken to be reversed.
 _REVERSED: Final = -0.3
-#: Slope of measured over expected turn rates above which the sensor's rates are in degrees per second.
+#: Slope of measured over expected turn rates above which the rates are taken to be in degrees per second.
 _IN_DEGREES: Final = 10.0
 #: Largest tested lag of the time tags [s].
 _LONGEST_LAG_S: Final = 20.0
 #: Smallest reported lag of the time tags [s].
 _LEAST_LAG_S: Final = 2.0
-#: Minimum ratio of the unexplained variance without a lag to the unexplained variance with the lag.
+#: Minimum factor by which a lag must reduce the unexplained variance.
 _LESS_ALIKE: Final = 2.0
-#: Largest difference of the mean force from gravity, as a fraction of gravity.
+#: Largest accepted difference of the mean force from gravity, as a fraction of gravity.
 _GRAVITY_SHARE: Final = 0.12
 
 
 @dataclass(frozen=True)
 class PositionMotion:
-    """Motion of an antenna from its positions, averaged over M cells of time; NaN if a neighbouring cell is empty."""
+    """Motion of an antenna, computed from positions averaged over M time cells; NaN if a neighbouring cell is empty."""
 
     time: Datetimes  #: Shape (M,).
     speed_mps: Floats  #: Speed toward rising chainage, shape (M,).
@@ -61,7 +61,7 @@ class PositionMotion:
 
 
 def compute_motion(places: pl.DataFrame, trajectory: Trajectory) -> PositionMotion:
-    """Compute the motion from ``time_gpst`` and ``chainage_m`` of single epochs, by means over cells of 4 s."""
+    """Compute the motion from ``time_gpst`` and ``chainage_m`` of single epochs, averaged over time cells of 4 s."""
     time = places["time_gpst"].to_numpy().astype("datetime64[ns]")
     since = seconds(time - time[0])
     cell = (since // _CELL_S).astype(np.int64)
@@ -84,7 +84,7 @@ def compute_motion(places: pl.DataFrame, trajectory: Trajectory) -> PositionMoti
 def sign_notes(
     samples: SensorSamples, places: pl.DataFrame, trajectory: Trajectory, tachometer: TachometerLimits
 ) -> Iterator[str]:
-    """Yield a sentence on each sensor with a wrong sign, unit or axis, or with time tags that are wrong by seconds.
+    """Yield a sentence on each wrong sign, unit or axis of a sensor, and on time tags that are wrong by seconds.
 
     `places` has ``time_gpst`` and ``chainage_m`` of the single-epoch positions of one antenna that passed every check.
     """
@@ -129,8 +129,8 @@ def _of_speeds(
 ) -> Iterator[str]:
     """Check the time tags and the sign of a speed sensor, and yield sentences on errors.
 
-    `forward` are the expected speeds at `time`, `speeds` returns the measured speeds. `directed` is the beginning of a
-    sentence on a wrong sign; if it is None, the sign is not checked.
+    `forward` are the expected speeds at `time`; the function `speeds` returns the measured speeds. `directed` is the
+    beginning of a sentence on a wrong sign; if it is None, the sign is not checked.
     """
     lag = _lag_s(time, np.abs(forward), lambda at: np.abs(speeds(at)), _LEAST_SPEED_MPS)
     if lag:
@@ -143,7 +143,7 @@ def _of_speeds(
 
 
 def _lag_s(time: Datetimes, expected: Floats, measured: Callable[[Datetimes], Floats], least: float) -> float:
-    """Return the lag of a sensor's time tags [s], positive for late tags; 0 if no lag of 2 s or more is certain."""
+    """Return the lag of a sensor's time tags [s], positive for late tags, or 0 if no lag of at least 2 s is certain."""
     x, found = _centre(expected), {}
     for lag in np.arange(-_LONGEST_LAG_S, _LONGEST_LAG_S + 1.0).tolist():
         y = measured(time + timedelta(np.array([lag])))
@@ -170,7 +170,7 @@ def _radar_speeds(radar: RadarSpeeds, time: Datetimes) -> Floats:
 
 
 def _means(time: Datetimes, values: Floats, middle: Datetimes) -> Floats:
-    """Return the means of samples within one cell length before and after each instant; NaN outside the samples."""
+    """Return the mean of the samples from one cell length before to one after each instant; NaN where not covered."""
     half = timedelta(np.array([_CELL_S]))
     begin, end = middle - half, middle + half
     first, last = np.searchsorted(time, begin), np.searchsorted(time, end)
@@ -180,13 +180,13 @@ def _means(time: Datetimes, values: Floats, middle: Datetimes) -> Floats:
 
 
 def _centre(values: Floats) -> Floats:
-    """Return values minus their mean, so that a bias or misalignment of the sensor does not affect the comparison."""
+    """Return the values minus their mean, so that a sensor bias or misalignment does not affect the comparison."""
     known = np.isfinite(values)
     return values - (values[known].mean() if known.any() else 0.0)
 
 
 def _forces_at_rest(inertial: InertialSamples) -> Iterator[str]:
-    """Yield a sentence if the median specific force is not gravity, which is -9.8 m/s2 on the axis that points down."""
+    """Yield a sentence if the median specific force is not that of gravity, -9.8 m/s2 on the axis that points down."""
     if not np.isfinite(inertial.force_mps2).any(axis=0).all():
         return
     forward, right, down = np.nanmedian(inertial.force_mps2, axis=0).tolist()
@@ -203,9 +203,7 @@ def _forces_at_rest(inertial: InertialSamples) -> Iterator[str]:
 
 
 def _slope(expected: Floats, measured: Floats, least: float) -> float:
-    """Return the slope of measured over expected values; NaN for too few values, or if the expected rms is below
-    `least`.
-    """
+    """Return the slope of measured over expected values; NaN for too few values or an expected rms below `least`."""
     known = np.isfinite(expected) & np.isfinite(measured)
     x, y = expected[known], measured[known]
     if len(x) < _LEAST_CELLS or np.sqrt(np.mean(x * x)) < least:
@@ -213,28 +211,28 @@ def _slope(expected: Floats, measured: Floats, least: float) -> float:
     return float((x * y).sum() / (x * x).sum())
 
 
-#: Interval of the compared wheel speeds [ns].
+#: Interval at which wheel speeds are compared [ns].
 _STEP_NS: Final = 500_000_000
-#: Largest time between a sensor speed and the Doppler speeds before and after it [s].
+#: Largest time from a sensor speed to the Doppler speeds before and after it [s].
 _NEAR_S: Final = 1.5
-#: Smallest reported scale error.
+#: Smallest reported relative scale error.
 _SCALE: Final = 0.01
 #: Smallest reported lag of speeds [s].
 _LAG_S: Final = 0.3
-#: Scale error too large to be caused by wheel wear; above it, the note suggests a wrong number of pulses per turn.
+#: Relative scale error that wheel wear cannot cause; above it, the note suggests another number of pulses per turn.
 _OTHER_TEETH: Final = 0.1
-#: Largest time between the satellite positions before and after a range that is compared with them [s].
+#: Largest time between the two satellite positions (before and after) with which a range is compared [s].
 _BETWEEN_S: Final = 3.0
-#: Minimum distance between the satellite positions before and after a range [m].
+#: Minimum distance between these two satellite positions [m].
 _MOVED_M: Final = 1.0
 #: Largest distance of a ground unit whose ranges are compared with satellite positions [m].
 _FAR_M: Final = 500.0
 #: Minimum cosine of the angle between the track and the direction to the ground unit.
 _AHEAD: Final = 0.7
-#: Minimum number of ranges to ground units ahead, or behind, for a comparison.
+#: Minimum number of ranges to ground units ahead (or behind) that are compared.
 _LEAST_RANGES: Final = 10
-#: Smallest reported difference between measured ranges and ranges computed from satellite positions [m]: twice the code
-#: error that lasts for minutes.
+#: Smallest reported difference between measured ranges and ranges computed from satellite positions [m]. It is twice
+#: the assumed code error that lasts for minutes.
 _RANGE_M: Final = 3.0
 
 
@@ -242,28 +240,28 @@ _RANGE_M: Final = 3.0
 class SensorChecks:
     """Satellite positions and speeds of one antenna, collected for the checks of the on-board sensors."""
 
-    #: Doppler speeds (`doppler_speeds`), one frame per chunk.
+    #: Doppler speeds (`doppler_speeds`), one table per chunk.
     speeds: list[pl.DataFrame] = field(default_factory=list)
-    #: Single-epoch positions that passed every check, one frame per chunk.
+    #: Single-epoch positions that passed every check, one table per chunk.
     places: list[pl.DataFrame] = field(default_factory=list)
 
     def take(self, positions: pl.DataFrame, train: pl.DataFrame) -> None:
-        """Add the rows of a chunk; at most two positions per second are kept."""
+        """Add the rows of a chunk. At most two positions per second are kept."""
         self.places.append(_thin(positions.filter(pl.col("status") == "ok").select("time_gpst", "chainage_m")))
         self.speeds.append(doppler_speeds(train))
 
     def notes(
         self, samples: SensorSamples, units: GroundUnits | None, trajectory: Trajectory, limits: SensorLimits
     ) -> tuple[str, ...]:
-        """Return a sentence on each sensor whose settings or table contradicts the satellites.
+        """Return sentences on sensors whose settings or table contradict satellite positioning.
 
         If a sign, unit, axis or time tag is wrong, scale errors and ranges are not checked.
         """
         if not self.speeds:
             return ()
-        places = _thin(pl.concat(self.places))  # independent of the length of the chunks
+        places = _thin(pl.concat(self.places))  # so that rows do not depend on the chunk length
         reversed_ones = tuple(sign_notes(samples, places, trajectory, limits.tachometer))
-        if reversed_ones:  # the filter's speeds, the reference of the other checks, depend on these sensors
+        if reversed_ones:  # other checks use the filter's speeds, which depend on these sensors
             return reversed_ones
         notes = sensor_notes(samples, pl.concat(self.speeds), limits.tachometer)
         if units is not None and len(samples.ranging):
@@ -271,7 +269,7 @@ class SensorChecks:
         return notes
 
     def radar_alarms(self, radar: RadarSpeeds) -> tuple[str, ...]:
-        """Return a sentence on each alarm of the radar (`RadarWatch`) in the time span of its table."""
+        """Return a sentence on each radar alarm (`RadarWatch`) in the time span of the radar table."""
         if not self.speeds or not len(radar):
             return ()
         speeds = pl.concat(self.speeds)
@@ -283,9 +281,9 @@ class SensorChecks:
 def range_notes(
     ranging: StationRanges, units: GroundUnits, places: pl.DataFrame, trajectory: Trajectory, limits: SensorLimits
 ) -> Iterator[str]:
-    """Yield sentences on ranges that contradict satellite positions by an offset along the track or a range bias.
+    """Yield sentences on an along-track offset or a bias of ranges compared with satellite positions.
 
-    `places` has ``time_gpst`` and ``chainage_m`` of an antenna; `limits` has the position of the ranging unit on the
+    `places` has ``time_gpst`` and ``chainage_m`` of an antenna. `limits` has the ranging unit's position on the
     vehicle.
     """
     of_unit = {str(name): k for k, name in enumerate(units.name)}
@@ -333,20 +331,20 @@ def range_notes(
 
 
 def _thin(places: pl.DataFrame) -> pl.DataFrame:
-    """Return at most two rows per second, the first of each half second of `time_gpst`."""
+    """Return at most two rows per second: the first row in each half second of `time_gpst`."""
     return places.unique(pl.col("time_gpst").dt.truncate("500ms"), keep="first", maintain_order=True)
 
 
 def doppler_speeds(train: pl.DataFrame) -> pl.DataFrame:
-    """Return ``time_gpst`` and ``speed_mps`` of the filtered positions for which Dopplers were used."""
+    """Return ``time_gpst`` and ``speed_mps`` of filtered positions that used Dopplers."""
     known = train.filter(pl.col("sources").str.contains("doppler"), pl.col("speed_mps").is_not_null())
     return known.select("time_gpst", "speed_mps")
 
 
 def sensor_notes(samples: SensorSamples, speeds: pl.DataFrame, tachometer: TachometerLimits) -> tuple[str, ...]:
-    """Return a sentence on each speed sensor with a wrong unit, a lag, or a scale error.
+    """Return sentences on wrong units, lags and scale errors of speed sensors.
 
-    `speeds` are the Doppler speeds of one antenna (`doppler_speeds`), `tachometer` the settings of the tachometer.
+    `speeds` are the Doppler speeds of one antenna (`doppler_speeds`); `tachometer` has the tachometer settings.
     """
     right_time = speeds["time_gpst"].to_numpy().astype("datetime64[ns]")
     right = speeds["speed_mps"].to_numpy()
@@ -370,7 +368,7 @@ def sensor_notes(samples: SensorSamples, speeds: pl.DataFrame, tachometer: Tacho
 
 
 def _check(time: Datetimes, speed_mps: Floats, right_time: Datetimes, right_mps: Floats) -> SpeedCheck | None:
-    """Compare sensor speeds with Doppler speeds (`right_mps`); return None if too few speeds have a common time."""
+    """Compare sensor speeds with Doppler speeds (`right_mps`). Return None if too few speeds are close in time."""
     if len(right_time) < 2 or not len(time):
         return None
     after = np.clip(np.searchsorted(right_time, time), 1, len(right_time) - 1)

@@ -1,4 +1,4 @@
-"""Reading of the samples of on-board sensors, of surveyed ground units, and of lists of balises."""
+"""Reading of on-board sensor samples, surveyed ground units, and lists of balises."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from railfix.pipeline.config import Config
 from railfix.track import Track
 from railfix.track.quality import section_spans
 
-#: Class of the samples by the name of the sensor.
+#: Class of samples by sensor name.
 _CLASSES: Final = {name: type(samples) for name, samples in SensorSamples().tables.items()}
 
 
@@ -30,9 +30,9 @@ def read_sensors(
     ranging: Path | None = None,
     balises: Path | None = None,
 ) -> SensorSamples:
-    """Read the tables of on-board sensors, CSV (also .gz) or Parquet; a sensor without a file has no samples.
+    """Read the tables of on-board sensors (.csv, .csv.gz, .parquet). A sensor without a file has no samples.
 
-    Raise InputFileError if a file is not a table of the sensor, or its times are not in order.
+    Raise InputFileError if a file is not a table of the sensor, or if its times are not in order.
     """
     paths = {
         "tachometer": tachometer, "inertial": inertial, "radar": radar, "ranging": ranging, "balises": balises
@@ -47,7 +47,7 @@ def read_sensors(
 
 
 def make_samples(sensor: str, time: Datetimes, columns: Mapping[str, NDArray[Any]]) -> Samples:
-    """Return the samples of a sensor from the times and the other columns of its table; absent numbers are NaN."""
+    """Return the samples of a sensor, given the times and the other columns of its table; absent numbers are NaN."""
     values = dict(columns)
     if sensor == "tachometer":
         values = {name: np.nan_to_num(column).astype(np.int64) for name, column in columns.items()}
@@ -60,11 +60,11 @@ def make_samples(sensor: str, time: Datetimes, columns: Mapping[str, NDArray[Any
 
 
 def units_of_ranges(samples: SensorSamples, units: Path | None, *, ranging: Path | str | None) -> GroundUnits | None:
-    """Read the surveyed ground units of two-way ranges; None without ranges.
+    """Read the surveyed ground units of two-way ranging. Return None if there are no ranges.
 
-    `ranging` is the table or the stream of the ranges. Raise InputFileError if `units` is not a table of ground units.
+    `ranging` is the table or the stream of ranges. Raise InputFileError if `units` is not a table of ground units.
     Raise MismatchError if `units` lacks the unit of a range. Raise SettingsError if only one of `units` and `ranging`
-    is given.
+    is specified.
     """
     if ranging is None and units is not None:
         raise SettingsError("--ranging-units is given without --ranging; give the ranges, or leave the units out")
@@ -79,9 +79,9 @@ def units_of_ranges(samples: SensorSamples, units: Path | None, *, ranging: Path
 
 
 def read_units(path: Path) -> GroundUnits:
-    """Read a table ``unit,x_m,y_m,z_m`` with surveyed ECEF positions of ground units, in the frame of the line.
+    """Read a table ``unit,x_m,y_m,z_m`` of surveyed ground units. ECEF positions are in the line's reference frame.
 
-    Raise InputFileError if the file is not such a table, or has a unit twice.
+    Raise InputFileError if the file is not such a table, or if it has a unit twice.
     """
     table = read_sensor_table(path, "ranging_units")
     names = table["unit"]
@@ -93,10 +93,10 @@ def read_units(path: Path) -> GroundUnits:
 def read_listed_balises(path: Path, track: Track, *, virtual: bool = False) -> ListedBalises:
     """Read a table of balises or virtual balises with columns ``balise,chainage_m`` and, if known, ``track,sigma_m``.
 
-    In a row with the name of a track, the chainage is measured from the beginning of that track. Balises on tracks that
-    are not part of the line, or beyond the ends of the line, are omitted.
+    If a row names a track, its chainage is measured from the beginning of that track. Balises that are beyond the ends
+    of the line, or on tracks that are not part of the line, are omitted.
 
-    Raise InputFileError if the file is not such a table, has a name twice, or has no balise on the line.
+    Raise InputFileError if the file is not such a table, names a balise twice, or has no balise on the line.
     """
     table = read_sensor_table(path, "list of balises")
     names = get_column(table, "balise")
@@ -123,7 +123,7 @@ def read_listed_balises(path: Path, track: Track, *, virtual: bool = False) -> L
 
 
 def _spans(track: Track) -> dict[str | None, tuple[float, float]]:
-    """Return start and end chainage [m] of each track by its source, name or file, and of the whole line under None."""
+    """Return start and end chainage [m] of each track by its source and name, and of the whole line (key None)."""
     spans: dict[str | None, tuple[float, float]] = {None: (0.0, float(track.chainage_m[-1]))}
     for source, (begin, end) in zip(track.sections, section_spans(track), strict=True):
         file, _, name = source.removesuffix(")").partition(" (")
@@ -134,10 +134,10 @@ def _spans(track: Track) -> dict[str | None, tuple[float, float]]:
 def load_balises(
     readings: Path | str | None, places: Path | None, virtual: Path | None, track: Track, config: Config
 ) -> ListedBalises | None:
-    """Read the lists of balises (`places`) and of virtual balises (`virtual`); None if neither is given.
+    """Read the lists of balises (`places`) and of virtual balises (`virtual`). Return None if there is neither.
 
-    `readings` is the table or the stream of balise readings. Raise InputFileError as `read_listed_balises` does, and
-    SettingsError if readings are given without a list or a list without readings, or virtual balises without protection
+    `readings` is the table or the stream of balise readings. Raise InputFileError as `read_listed_balises` does. Raise
+    SettingsError if only one of readings and list is specified, or if there are virtual balises, but no protection
     levels of the filter.
     """
     if virtual is not None and (config.filter == "off" or config.tracking.level == "off"):
@@ -156,7 +156,7 @@ def load_balises(
 
 
 def check_filter(config: Config, options: Iterable[str]) -> None:
-    """Raise SettingsError if the filter along the track is off and `options`, which need it, is not empty."""
+    """Raise SettingsError if the along-track filter is off, but `options` has options that require it."""
     for name in options:
         if config.filter == "off":
             raise SettingsError(f"--{name} needs the filter along the track; leave out --filter off")

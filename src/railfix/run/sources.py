@@ -1,4 +1,4 @@
-"""Inputs of a run: the line with the trajectories of the antennas, and logs in chunks of equal time spans."""
+"""Inputs of a run: the line with the antenna trajectories, and the logs in chunks of equal time spans."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ if TYPE_CHECKING:
     from railfix.run.route import LogPositions, RouteOfLog
 
 
-#: Minimum length of the track of a run [m].
+#: Minimum length of a track [m].
 _SHORTEST_M: Final = 1.0
-#: Name of the file in the results folder with the track of a run, if the track differs from the input files.
+#: Name of the file in the results folder that has the run's track, if the track differs from the input files.
 TRACK_FILE: Final = "track.csv"
 
 
@@ -52,12 +52,12 @@ class OpenedLine:
     track: Track
     vehicle: Vehicle | None
     trajectories: dict[str, Trajectory]  #: Trajectory by antenna.
-    #: Transformation of the track to the frame of the satellites; None if no time was given.
+    #: Transformation of the track to the satellites' reference frame; None if no time was specified.
     frame: FrameShift | None = None
-    #: Route through a network of tracks that was found from the log; None if the files are a single route.
+    #: Route that was found from the log in a network of tracks; None if the files are a single route.
     route: RouteOfLog | None = None
-    #: Whether the track is exactly as in its files, that is, it is not a route of a network, has no heights from
-    #: another source, and was not transformed to another frame.
+    #: Whether the track is exactly as in its files: no route of a network, no heights from another source, and no
+    #: transformation to another frame.
     from_file: bool = True
     preparing: tuple[str, ...] = ()  #: Notes on the cache of prepared lines.
 
@@ -75,7 +75,7 @@ class OpenedLine:
 
     @property
     def turns_m(self) -> dict[str, float]:
-        """Length of a closed line in the chainage of each antenna [m]; infinite if the line is not closed."""
+        """Length of a closed line by antenna, in the antenna's chainage [m]; infinite if the line is not closed."""
         turns = {}
         for name, path in self.trajectories.items():
             before, after = path.chainage_at(np.array(path.joins_m))
@@ -121,10 +121,10 @@ def open_line(
 ) -> OpenedLine:
     """Read the track and the vehicle, and compute the trajectory of each antenna.
 
-    With a time `at`, the track is transformed to the frame of the satellites at that time (`railfix.track.frames`);
-    otherwise the coordinates remain in the frame of the map. A single file whose tracks do not join to one route is a
-    network, in which the route is found from `log`. If `heights` is `OF_LOG`, the heights of a map without heights are
-    taken from the positions of `log`. Raise a RailfixError (`railfix.core.errors`) if a file or the route is unusable.
+    With a time `at`, the track is transformed to the satellites' reference frame at that time (`railfix.track.frames`).
+    Without it, coordinates remain in the map's frame. A single file whose tracks do not join to one route is a network;
+    its route is found from `log`. If `heights` is `OF_LOG`, a map without heights gets the heights of the positions of
+    `log`. Raise a RailfixError (`railfix.core.errors`) if a file or the route is unusable.
     """
     prepared = PreparedLines(use=reading.cache == "use")
     key = compute_key("line", *track, heights, *vars(reading.of_map).values(), reading.height_sigma)
@@ -150,7 +150,7 @@ def open_line(
 
 
 def _check_extent(files: tuple[Path, ...], track: Track) -> None:
-    """Raise MismatchError if the track is shorter than `_SHORTEST_M`, or has impossible heights."""
+    """Raise MismatchError if the track is shorter than `_SHORTEST_M`, or if its heights are impossible."""
     if (length := float(track.chainage_m[-1] - track.chainage_m[0])) < _SHORTEST_M:
         raise MismatchError(f"{', '.join(map(str, files))}: is {length:g} m long; give the track of a line")
     low, high = float(np.nanmin(track.height_m)), float(np.nanmax(track.height_m))
@@ -164,7 +164,7 @@ def _check_extent(files: tuple[Path, ...], track: Track) -> None:
 def _read_line(
     track: tuple[Path, ...], reading: TrackReading, *, heights: Path | None, log: LogPositions | None
 ) -> tuple[Track, RouteOfLog | None]:
-    """Read the track, and find the route if the file is a network; the route is None otherwise."""
+    """Read the track. If the file is a network, also find the route; otherwise the route is None."""
     if not track:
         raise SettingsError("no track map was given; give it with --track")
     segments = [segment for path in track for segment in read_segments(path, reading.of_map)]
@@ -199,7 +199,7 @@ def _read_line(
 def _paths(
     track: Track, vehicle: Path | None, antennas: tuple[Antenna, ...], reading: TrackReading, prepared: PreparedLines
 ) -> tuple[Vehicle | None, dict[str, Trajectory]]:
-    """Return the vehicle and the trajectory of each antenna; without a vehicle, the track is the trajectory."""
+    """Return the vehicle and the trajectory of each antenna. Without a vehicle, the trajectory is the track."""
     if vehicle is None:
         if reading.reference != "antenna":
             raise SettingsError(
@@ -221,7 +221,7 @@ def _paths(
 
 @dataclass(kw_only=True)
 class Log:
-    """Log of one antenna in one or several files, read piece by piece."""
+    """Log of one antenna in one or several files, which is read in pieces."""
 
     paths: tuple[Path, ...]
     chunk_epochs: int  #: Maximum number of epochs of a piece.
@@ -233,7 +233,7 @@ class Log:
     skipped: Counter[str] = field(default_factory=Counter)  #: Numbers of skipped items by kind.
 
     def parts(self) -> Generator[Observations]:
-        """Yield the pieces of the log in order of time; raise the errors of `railfix.io.logs.scan_observations`."""
+        """Yield the log in pieces, in order of time. Errors are raised as in `railfix.io.logs.scan_observations`."""
         pieces = scan_observations(
             self.paths,
             epochs=self.chunk_epochs,
@@ -249,7 +249,7 @@ class Log:
                 yield piece
 
     def first_epochs(self) -> Iterator[tuple[Path, np.datetime64]]:
-        """Yield the path and the first epoch of each file, within `start` and `end`; nothing for a log in one file."""
+        """Yield the path and the first selected epoch of each file, or nothing if the log is a single file."""
         for path in self.paths if len(self.paths) > 1 else ():
             alone = replace(self, paths=(path,), problems=[], skipped=Counter(), chunk_epochs=1)
             with suppress(MismatchError), closing(alone.parts()) as parts:
@@ -260,16 +260,16 @@ class Log:
 
 
 Item = TypeVar("Item")
-#: Largest difference of the time tags of two receivers for the same instant [ns].
+#: Largest difference between two receivers' time tags of the same instant [ns].
 SAME_INSTANT_NS: Final = 20_000_000
 
 
 def align_logs(logs: Mapping[str, Iterator[Observations]]) -> Iterator[dict[str, Observations]]:
     """Yield chunks of observations that cover the same time span for every antenna.
 
-    Each antenna has its own epochs, and may have none in a span. A chunk ends at the earliest end of the current parts;
-    later epochs of the other parts are in the next chunk. Epochs of the same instant whose time tags differ slightly
-    (`SAME_INSTANT_NS`) are in the same chunk.
+    Each antenna has its own epochs, and may have none in a span. One part of each log is read at a time; the chunk ends
+    where the first of these parts ends, and later epochs of other parts are in the next chunk. Epochs of the same
+    instant whose time tags differ slightly (`SAME_INSTANT_NS`) are in the same chunk.
     """
     live = dict(logs)
     waiting: dict[str, Observations] = {}
@@ -297,7 +297,7 @@ def align_logs(logs: Mapping[str, Iterator[Observations]]) -> Iterator[dict[str,
             horizon = min(waiting[name].time[-1] for name in live) + np.timedelta64(slack, "ns")
             cut = {name: int(np.searchsorted(part.time, horizon, side="right")) for name, part in waiting.items()}
         yield {name: part[: cut[name]] for name, part in waiting.items()}
-        # A short remainder would split every following chunk, and is therefore joined with the next part.
+        # A short remainder is joined with the next part, because it would split every following chunk.
         short = [n for n in live if 0 < len(waiting[n]) - cut[n] < len(waiting[n]) // 2]
         waiting = {name: part[cut[name] :] for name, part in waiting.items()}
         for name in short:
@@ -305,7 +305,7 @@ def align_logs(logs: Mapping[str, Iterator[Observations]]) -> Iterator[dict[str,
 
 
 def read_ahead(items: Iterator[Item]) -> Iterator[Item]:
-    """Yield the items of an iterator while a separate thread computes the next item; the items must not be None."""
+    """Yield the items of an iterator while another thread computes the next item. The items must not be None."""
     with ThreadPoolExecutor(max_workers=1) as reader:
         coming = reader.submit(next, items, None)
         while (item := coming.result()) is not None:
@@ -314,9 +314,9 @@ def read_ahead(items: Iterator[Item]) -> Iterator[Item]:
 
 
 def without_beside(result: Result, route: RouteOfLog, config: Config) -> Result:
-    """Return results with doubtful statuses and infinite protection levels where the track is uncertain.
+    """Return the results with doubtful statuses and infinite protection levels where the track is uncertain.
 
-    The track is uncertain if other tracks are more probable than `Config.track_risk` (`RouteOfLog.is_uncertain`).
+    The track is uncertain if the probability of other tracks exceeds `Config.track_risk` (`RouteOfLog.is_uncertain`).
     """
     antennas, fusion = dict(result.antennas), dict(result.fusion)
     for name, single in antennas.items():

@@ -1,4 +1,4 @@
-"""Pseudoranges (codes) and carrier phases of an antenna at rest, minus a base station's observations if given."""
+"""Codes (pseudoranges) and carrier phases of an antenna at rest, optionally as differences from a base station."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from railfix.positioning.standstill_phase import MeanPhases
 from railfix.positioning.track_choice import StandstillErrors, StandstillFix, standstill_fix
 from railfix.ranges.atmosphere import thin_shell_obliquity
 
-#: Minimum fraction of the epochs in which a satellite must have a residual, so that the means of all satellites cover
-#: nearly the same epochs.
+#: A satellite is used if it has residuals in at least this fraction of the epochs, so that the means of all satellites
+#: are over nearly the same epochs.
 _SHARE: Final = 0.9
-#: Standard deviation of satellite and atmospheric errors that remain with a base station at most 10 km away [m].
+#: Standard deviation of the remaining satellite and atmospheric errors with a base station within 10 km [m].
 _BESIDE_BASE_M: Final = 0.05
-#: An antenna counts as at rest if the median positions of the thirds of its log differ by at most this in plan [m].
+#: An antenna is at rest if the median positions in the three thirds of its log differ by at most this in plan [m].
 _AT_REST_M: Final = 8.0
-#: Change of a double difference between epochs that indicates a cycle slip [wavelengths].
+#: A larger change of a double difference between epochs is taken as a cycle slip [wavelengths].
 _SLIP: Final = 0.25
-#: Minimum length of the longest part of a double difference without a slip, as a fraction of the epochs.
+#: Minimum length of a double difference's longest part without a slip, as a fraction of the epochs.
 _UNBROKEN: Final = 0.5
-#: Bits of the loss-of-lock indicator (RINEX): a slip since the previous epoch, and half-cycle ambiguity.
+#: RINEX loss-of-lock bits: bit 0 for a cycle slip since the previous epoch, bit 1 for a half-cycle ambiguity.
 _LOST, _HALF_CYCLE = 1, 2
 
 
@@ -42,19 +42,19 @@ class StandstillCodes:
     """Code residuals of one antenna at rest, computed for the position `origin_ecef_m`: T epochs, K satellites."""
 
     time: Datetimes  #: Shape (T,).
-    #: Measured minus computed codes, reduced by the mean over the satellites of each clock group, shape (T, K); NaN
-    #: where a satellite was not used.
+    #: Measured minus computed codes, minus their mean over the satellites of each clock group, shape (T, K). NaN where
+    #: a satellite was not used.
     residual_m: Floats
     system: Strings  #: Clock group of each satellite, shape (K,).
     azimuth_deg: Floats  #: Mean azimuth of each satellite, shape (K,).
     elevation_deg: Floats  #: Mean elevation of each satellite, shape (K,).
     common_m: Floats  #: Standard deviation of satellite and atmospheric errors, shape (K,).
-    receivers: int  #: Factor of the variance of receiver errors: 2 if a base station's codes are subtracted, else 1.
+    receivers: int  #: Number of receivers in the residuals: 2 if a base station's codes are subtracted, else 1.
     origin_ecef_m: Floats  #: Shape (3,).
     phases: StandstillPhases | None = None  #: Carrier phases; None without a base station.
 
     def fix(self, epochs: slice, errors: StandstillErrors) -> StandstillFix | None:
-        """Return the mean position over some epochs; None if the satellites do not determine the position."""
+        """Return the mean position over `epochs`, or None if the satellites do not determine a position."""
         seconds = float((self.time[epochs][-1] - self.time[epochs][0]) / np.timedelta64(1, "s"))
         return standstill_fix(
             self.azimuth_deg,
@@ -76,12 +76,12 @@ def standstill_codes(
     base: tuple[Observations, Floats] | None = None,
     origin_ecef_m: Floats | None = None,
 ) -> StandstillCodes:
-    """Return the code residuals of an antenna at rest and, with a base station, its carrier phases.
+    """Return the code residuals of an antenna at rest, and, with a base station, its carrier phases.
 
-    The residuals are computed for the position `origin_ecef_m`, by default the median position of the antenna. `base`
-    has the observations of a base station and its position, ECEF, shape (3,) [m]. Raise NoPositionError if the log has
-    fewer than two positions. Raise MismatchError if the antenna moves, no satellite is observed over the whole log, or
-    the log has no epoch or signal in common with the base station.
+    The residuals are computed for the position `origin_ecef_m`; the default is the antenna's median position. `base`
+    has the observations and the ECEF position of a base station, shape (3,) [m]. Raise NoPositionError if the log has
+    fewer than two positions. Raise MismatchError if the antenna moves, if no satellite is observed over the whole log,
+    or if the log and the base station have no epoch or no signal in common.
     """
     received, book = known_from_start(config, navigation=navigation), ChannelBook(config)
     seen = ranges_without_map(obs, received, config, book)
@@ -89,7 +89,7 @@ def standstill_codes(
     places = places[np.isfinite(places[:, 0])]
     if len(places) < 2:
         raise NoPositionError("the log has no position; check that the navigation files are from the day of the log")
-    # three parts, because a train that returns has the same position at the beginning and the end of the log
+    # three parts, because a train that returns to its position has equal positions at the beginning and end of the log
     thirds = np.array([np.median(part, axis=0) for part in np.array_split(places, min(3, len(places)))])
     level = (thirds - thirds[0]) @ axes_at(places[0])[:2].T
     moved = float(np.linalg.norm(level, axis=1).max())
@@ -117,7 +117,7 @@ def standstill_codes(
     residual = residual[:, kept]
     for letter in np.unique(system):
         rows = system == letter
-        received = np.isfinite(residual[:, rows]).sum(axis=1, keepdims=True)  # the number is 0 in a tunnel
+        received = np.isfinite(residual[:, rows]).sum(axis=1, keepdims=True)  # 0 in a tunnel
         residual[:, rows] -= np.nansum(residual[:, rows], axis=1, keepdims=True) / np.maximum(received, 1)
     elevation, azimuth = seen.corrected.elevation_deg[:, columns[kept]], seen.corrected.azimuth_deg[:, columns[kept]]
     turn = np.radians(azimuth)
@@ -135,16 +135,16 @@ def standstill_codes(
 
 
 def _residual(seen: RangesWithoutMap, origin_ecef_m: Floats) -> Floats:
-    """Return measured minus computed codes at a position [m]; NaN where a code is not used."""
+    """Return measured codes minus codes computed for a position [m]; NaN where a code is not used."""
     ranges = seen.ranges
     computed, _ = range_with_rotation(ranges.sat_ecef_m, origin_ecef_m)
     return np.where(ranges.weight > 0.0, ranges.code_m - computed, np.nan)
 
 
 def _common_epochs(obs: Observations, other: Observations) -> tuple[Indices, Indices]:
-    """Return the indices of the epochs of two logs with the same time tags, rounded to 0.1 s.
+    """Return the indices of the epochs in each of two logs that have equal time tags, rounded to 0.1 s.
 
-    Raise MismatchError if there are none.
+    Raise MismatchError if there are no such epochs.
     """
     step = np.timedelta64(100, "ms")
     stamps = [np.round((t - obs.time[0]) / step).astype(np.int64) for t in (obs.time, other.time)]
@@ -155,7 +155,7 @@ def _common_epochs(obs: Observations, other: Observations) -> tuple[Indices, Ind
 
 
 def _common_channels(seen: RangesWithoutMap, other: RangesWithoutMap) -> tuple[Indices, Indices]:
-    """Return the indices of the channels that two receivers have in common; raise MismatchError if there are none."""
+    """Return the indices, in each of two receivers, of their common channels. Raise MismatchError if there are none."""
     names = [s.corrected.channels.names.tolist() for s in (seen, other)]
     shared = [name for name in names[0] if name in names[1]]
     if not shared:
@@ -168,14 +168,14 @@ def _common_channels(seen: RangesWithoutMap, other: RangesWithoutMap) -> tuple[I
 class StandstillPhases:
     """Single differences of carrier phases between an antenna at rest and a base station: T epochs, M satellites."""
 
-    #: Measured minus computed single differences, shape (T, M); NaN if a receiver has no usable phase.
+    #: Measured minus computed single differences, shape (T, M); NaN where a receiver has no usable phase.
     difference_m: Floats
-    lost: Masks  #: Whether one of the receivers reports a cycle slip since the previous epoch, shape (T, M).
-    toward: Floats  #: Unit vectors to the satellites: east, north, up; shape (T, M, 3).
+    lost: Masks  #: Whether a receiver reports a cycle slip since the previous epoch, shape (T, M).
+    toward: Floats  #: Unit vectors to the satellites (east, north, up), shape (T, M, 3).
     elevation_deg: Floats  #: Shape (T, M).
     wavelength_m: Floats  #: Shape (M,).
-    group: Strings  #: Clock group and signal; double differences are formed within one group; shape (M,).
-    distance_m: float  #: Distance of the antenna from the base station [m].
+    group: Strings  #: Clock group and signal, shape (M,). Double differences are formed within a group.
+    distance_m: float  #: Distance between the antenna and the base station [m].
 
     def mean(self, epochs: slice, errors: StandstillErrors) -> MeanPhases:
         """Return the mean of each double difference over the longest part of `epochs` without a cycle slip.
@@ -215,7 +215,7 @@ class StandstillPhases:
 
 
 def _longest_part(values: Floats, lost: Masks, slip: float) -> slice:
-    """Return the longest run of epochs with values and without a slip; an empty slice if there are no values."""
+    """Return the longest run of epochs with values and without a slip, or an empty slice if there are no values."""
     known = np.flatnonzero(np.isfinite(values))
     if not len(known):
         return slice(0, 0)
@@ -230,14 +230,14 @@ _Side = tuple[Observations, RangesWithoutMap, Floats, Indices, Indices]
 
 
 def _phases(train: _Side, base: _Side) -> StandstillPhases:
-    """Return single differences of phases; GLONASS is omitted, because its wavelengths differ between satellites."""
+    """Return single differences of phases. GLONASS is omitted, because its wavelengths differ between satellites."""
     sides, lost = [], []
     for obs, seen, place, epochs, columns in (train, base):
         channel = seen.corrected.channels.columns[columns]
         wavelength = SPEED_OF_LIGHT / seen.corrected.channels.frequency_hz[columns]
         rows = np.ix_(epochs, columns)
-        # The corrections are those of the codes. The ionospheric delay has the opposite sign for phases, but cancels in
-        # the difference.
+        # The code corrections are also applied to the phases. The ionospheric correction then has the wrong sign, but
+        # it cancels in the difference.
         corrections = seen.ranges.code_m[rows] - obs.code_m[np.ix_(epochs, channel)]
         lock = obs.loss_of_lock[np.ix_(epochs, channel)]
         phase = obs.phase_cycles[np.ix_(epochs, channel)] * wavelength + corrections

@@ -1,4 +1,4 @@
-"""Counts of the epochs and observations of a run, and writing of the tables of each chunk."""
+"""Counts of the epochs and observations of a run, and writing of the result tables in chunks."""
 
 from __future__ import annotations
 
@@ -44,14 +44,14 @@ if TYPE_CHECKING:
 
 
 _NOT_A_REJECTION = Reason.NOT_OBSERVED
-#: Results of the interference checks for which an offset of the positions is still attributed to the map.
+#: Results of the interference check with which an offset of the positions may still be a map error.
 _MAP_IN_QUESTION: Final = (Suspicion.NONE, Suspicion.JAMMING_SUSPECTED, Suspicion.CONTRADICTED)
 _NO_RECORD = Reason.NO_EPHEMERIS | Reason.EPHEMERIS_TOO_OLD
 
 
 @dataclass(frozen=True, kw_only=True)
 class MapOffsetFound:
-    """Mean offset of the 3-D positions in a window from the line."""
+    """Mean offset from the line of the 3-D positions in a time window."""
 
     time: np.datetime64  #: End of the window.
     across_m: float  #: Offset to the right of the line [m].
@@ -75,9 +75,9 @@ class MapOffsetFound:
 
 @dataclass(kw_only=True)
 class AntennaTally:
-    """Counts of one antenna."""
+    """Counts of one antenna's epochs and observations."""
 
-    min_satellites: int = 3  #: Minimum number of satellites per epoch.
+    min_satellites: int = 3  #: Minimum number of satellites of a position.
     judged: dict[str, bool] = field(default_factory=dict)  #: Whether each screen has tested any observation.
     epochs: int = 0  #: Number of epochs.
     observed: int = 0  #: Number of epochs with at least one pseudorange.
@@ -85,46 +85,46 @@ class AntennaTally:
     observations: int = 0  #: Number of pseudoranges.
     used: int = 0  #: Number of pseudoranges used for positions.
 
-    status: Counter[str] = field(default_factory=Counter)  #: Epochs by status.
-    status_positioned: Counter[str] = field(default_factory=Counter)  #: Epochs with coordinates by status.
-    #: Number of epochs with too few satellites, by the first rejection reason, in the order of the bits, after which
-    #: too few satellites remain. `not_observed` means that too few satellites were observed; `used` means that enough
-    #: satellites remained, but their clocks left no range for the position.
+    status: Counter[str] = field(default_factory=Counter)  #: Number of epochs by status.
+    status_positioned: Counter[str] = field(default_factory=Counter)  #: Number of epochs with coordinates by status.
+    #: Number of epochs with too few satellites, by decisive reason. Rejection reasons are applied in the order of their
+    #: bits; the decisive reason is the first after which too few satellites remain. It is `not_observed` if too few
+    #: satellites were observed, and `used` if enough remained, but their clocks left no range for the position.
     short_first: Counter[str] = field(default_factory=Counter)
-    #: Number of epochs with too few satellites, by each rejection reason without which enough satellites would remain.
+    #: Number of epochs with too few satellites that would have enough without a rejection reason, by this reason.
     short_only: Counter[str] = field(default_factory=Counter)
     #: Number of rejected observations by their first rejection reason.
     first_reason: Counter[str] = field(default_factory=Counter)
-    #: Number of observations with a single rejection reason, by this reason.
+    #: Number of observations with only one rejection reason, by this reason.
     only_reason: Counter[str] = field(default_factory=Counter)
-    satellites: Counter[str] = field(default_factory=Counter)  #: Observations by satellite.
-    #: Observations by satellite without a valid navigation record.
+    satellites: Counter[str] = field(default_factory=Counter)  #: Number of observations by satellite.
+    #: Number of observations without a valid navigation record, by satellite.
     unrecorded: Counter[str] = field(default_factory=Counter)
 
     first: np.datetime64 | None = None
     last: np.datetime64 | None = None
-    conventional: int = 0  #: Epochs with a valid conventional position.
-    #: Smallest distance of a conventional position from the trajectory [m]; NaN without a conventional position.
+    conventional: int = 0  #: Number of epochs with a valid conventional position.
+    #: Smallest distance of a valid conventional position from the trajectory [m]; NaN if there is none.
     conventional_nearest_m: float = float("nan")
-    #: Epochs by status of the protection level; empty if protection levels are off.
+    #: Number of epochs by status of the protection level; empty if protection levels are off.
     level_status: Counter[str] = field(default_factory=Counter)
     #: Number of epochs without a protection level because simultaneous faults of more satellites than can be excluded
     #: are more probable than the risk allows, or because too many satellites are excluded.
     without_budget: int = 0
-    #: Map offset with the largest test statistic; None before there were enough positions.
+    #: Map offset with the largest test statistic; None if no window had enough positions.
     map_offset: MapOffsetFound | None = None
-    #: By satellite, the number of epochs at which the filter excluded the satellite's codes as persistently wrong, and
-    #: the first of these epochs.
+    #: Number of epochs at which the filter excluded a satellite's codes as persistently wrong, and the first of these
+    #: epochs, by satellite.
     left_out: dict[str, tuple[int, np.datetime64]] = field(default_factory=dict)
-    #: As `left_out`, for codes excluded by single-epoch positioning.
+    #: Same as `left_out`, but for codes that single-epoch positioning excluded.
     lasting: dict[str, tuple[int, np.datetime64]] = field(default_factory=dict)
-    #: By sign of interference, the number of epochs with this sign, and the first of these epochs.
+    #: Number of epochs with a sign of interference, and the first of these epochs, by sign.
     interference: dict[str, tuple[int, np.datetime64]] = field(default_factory=dict)
     #: Smallest and largest time-tag error at epochs with suspected time tags [s], positive for late tags; NaN without
     #: such epochs.
     tag_error_s: tuple[float, float] = (float("nan"), float("nan"))
-    #: Smallest (row 0) and largest (row 1) detectable map offset of all windows, across (column 0) and up (column 1),
-    #: shape (2, 2) [m]; NaN without a window.
+    #: Detectable map offset, shape (2, 2) [m]: smallest (row 0) and largest (row 1) of all windows, across (column 0)
+    #: and up (column 1). NaN if there is no window.
     map_detectable_m: Floats = field(default_factory=lambda: np.full((2, 2), np.nan))
 
     def add(self, result: AntennaResult) -> None:
@@ -161,7 +161,7 @@ class AntennaTally:
     def add_conventional(self, result: AntennaResult) -> None:
         """Count the valid conventional positions, and update their smallest distance from the trajectory.
 
-        Other conventional positions are ignored, because inconsistent ranges give arbitrary positions.
+        Invalid conventional positions are ignored, because inconsistent ranges give arbitrary positions.
         """
         offset = result.conventional_offset_m[result.conventional_status == PointStatus.VALID]
         self.conventional += len(offset)
@@ -176,7 +176,7 @@ class AntennaTally:
             self.tag_error_s = float(np.fmin(low, error.min())), float(np.fmax(high, error.max()))
 
     def _add_map_offset(self, result: AntennaResult) -> None:
-        """Keep the window with the largest test statistic of the map offset that interference does not explain."""
+        """Keep the map offset with the largest test statistic, windows with an interference cause excluded."""
         offset, interference = result.map_offset, result.interference
         if not np.isfinite(offset.statistic).any():
             return
@@ -212,14 +212,14 @@ class AntennaTally:
                 counter[str(result.satellite[channel])] += int(of_channel[channel])
 
     def _add_short(self, result: AntennaResult) -> None:
-        """Count the reasons for too few satellites (`short_first`, `short_only`)."""
+        """Count the reasons for too few satellites in `short_first` and `short_only`."""
         short = np.flatnonzero(result.status == Status.TOO_FEW_SATELLITES)
         if not len(short):
             return
         names, which = np.unique(result.satellite, return_inverse=True)
         member = (which[:, None] == np.arange(len(names))).astype(np.int64)
         reason = result.reason[short]
-        # An unselected signal of a satellite was not checked, and therefore does not count as usable.
+        # Signals that were not selected were not checked, and are therefore not counted as usable.
         looked_at = (reason & Reason.OTHER_SIGNAL_TAKEN) == 0
 
         def enough(without: int) -> Masks:
@@ -239,7 +239,7 @@ class AntennaTally:
 
     @property
     def never_recorded(self) -> dict[str, int]:
-        """Numbers of observations of the satellites that never had a valid navigation record, by satellite."""
+        """Number of observations by satellite, for satellites that never had a valid navigation record."""
         return {s: n for s, n in sorted(self.unrecorded.items()) if n == self.satellites[s]}
 
     def as_dict(self) -> dict[str, Any]:
@@ -275,11 +275,11 @@ class Tally:
 
     min_satellites: int = 3  #: Minimum number of satellites per epoch.
     antennas: dict[str, AntennaTally] = field(default_factory=dict)
-    #: Notes of all chunks as keys, in the order in which they were added.
+    #: Notes of all chunks, as keys, in order of time.
     notes: dict[str, None] = field(default_factory=dict)
-    #: For each chunk, its first epoch, its number of epochs of all antennas, and the elapsed time of positioning [s].
+    #: First epoch, number of epochs of all antennas, and processing time [s] of each chunk.
     chunks: list[tuple[np.datetime64, int, float]] = field(default_factory=list)
-    order: AntennaOrder | None = None  #: Test whether front and rear antenna are exchanged; None with one antenna.
+    order: AntennaOrder | None = None  #: Test for exchanged front and rear antennas; None with one antenna.
 
     def add(self, result: Result) -> None:
         """Add the counts of a chunk of results."""
@@ -296,12 +296,12 @@ class Tally:
 
     @property
     def all_notes(self) -> tuple[str, ...]:
-        """Notes of all chunks, and the note on the order of the antennas if there is one."""
+        """Notes of all chunks, and any note on exchanged antennas."""
         order = None if self.order is None else self.order.note
         return tuple(self.notes) if order is None else (*self.notes, order)
 
     def took(self, times: Iterable[Datetimes], spent_s: float) -> None:
-        """Record the elapsed time of positioning a chunk [s]; `times` has the time tags of each antenna."""
+        """Record the processing time of a chunk [s]. `times` has the time tags of each antenna."""
         some = [part for part in times if len(part)]
         if some:
             self.chunks.append((min(part[0] for part in some), sum(map(len, some)), spent_s))
@@ -320,9 +320,9 @@ class Tally:
 def _count_left_out(
     counts: dict[str, tuple[int, np.datetime64]], left_out: Masks, satellite: Strings, time: Datetimes
 ) -> None:
-    """Add to `counts` the number of epochs with a set flag in each column of `left_out`, shape (T, K).
+    """Add to `counts` the number of epochs flagged in each column of `left_out`, shape (T, K).
 
-    The names of the columns are in `satellite`. The first of these epochs is kept for each name.
+    `satellite` has the column names. For each name, the first flagged epoch is also kept.
     """
     for k in np.flatnonzero(left_out.any(axis=0)).tolist():
         name, first = str(satellite[k]), time[int(np.argmax(left_out[:, k]))]
@@ -330,7 +330,7 @@ def _count_left_out(
         counts[name] = (before[0] + int(left_out[:, k].sum()), before[1])
 
 
-#: Functions that return the tables of results by name; the tables of the filter are None without the filter.
+#: Functions that return the result tables, by table name. Tables of the filter are None without the filter.
 TABLES: Final[Mapping[str, Callable[[Result], pl.DataFrame | None]]] = {
     "positions": positions_table,
     "train": lambda result: train_table(result) if result.fusion else None,
@@ -339,8 +339,7 @@ TABLES: Final[Mapping[str, Callable[[Result], pl.DataFrame | None]]] = {
 
 
 def make_tables(result: Result, *, passings: bool) -> dict[str, pl.DataFrame]:
-    """Return the tables of a chunk by name: positions, and with the filter, filtered positions and, on request,
-    passings.
+    """Return the tables of a chunk by name. Filtered positions and passings (optional) exist only with the filter.
 
     The table of passings may have no rows.
     """
@@ -350,19 +349,19 @@ def make_tables(result: Result, *, passings: bool) -> dict[str, pl.DataFrame]:
 
 @dataclass(frozen=True, kw_only=True)
 class ResultRows:
-    """Writer of the tables of a run, chunk by chunk."""
+    """Writer of the tables of a run, in chunks."""
 
     folder: OutputFolder
     line: OpenedLine
     observations: bool  #: Whether the table of observations is written.
-    checks: SensorChecks | None  #: Collects the positions of the first antenna; None without sensors.
-    replays: Mapping[str, Replays]  #: Stores the input of the filter by antenna; empty without smoothing.
+    checks: SensorChecks | None  #: Sensor checks with the first antenna; None without sensors.
+    replays: Mapping[str, Replays]  #: Filter input by antenna, stored for smoothing; empty without smoothing.
     passings: bool = False  #: Whether the table of passings of balises and virtual balises is written.
-    #: Notes on balises that were missed, or read at a wrong position.
+    #: Notes on balises that were missed or were read at a wrong position.
     balise_notes: list[str] = field(default_factory=list)
 
     def write(self, result: Result) -> None:
-        """Append the rows of a chunk to the tables; on a route of a network, the rows include the tracks."""
+        """Append the rows of a chunk to the tables. On a network, columns and a table of tracks are added."""
         tables = make_tables(result, passings=self.passings)
         if self.observations:
             tables["observations"] = observations_table(result)
@@ -390,13 +389,13 @@ _MOST_NOTES: Final = 20
 
 
 def shorten_notes(notes: list[str]) -> list[str]:
-    """Return at most `_MOST_NOTES` notes, followed by a sentence with the number of omitted notes if there are any."""
+    """Return at most `_MOST_NOTES` notes. If notes are omitted, a last sentence states their number."""
     more = len(notes) - _MOST_NOTES
     return notes if more <= 0 else [*notes[:_MOST_NOTES], f"{more} more notes on balises; see the table of passings"]
 
 
 class Replays:
-    """Input of the filter for smoothing, stored in a temporary file that is deleted with the object or the process."""
+    """Filter input for smoothing, in a temporary file. The file is deleted at the end of the object or the process."""
 
     def __init__(self) -> None:
         self._file = tempfile.TemporaryFile()  # noqa: SIM115  open as long as the run
@@ -418,7 +417,7 @@ class Replays:
 
 
 def add_smoothed(replays: Mapping[str, Replays], processor: EpochProcessor, folder: OutputFolder) -> None:
-    """Smooth the stored filter input of each antenna, and write `train.*` again with the columns of the smoother."""
+    """Smooth each antenna's filter input, and rewrite `train.*` with the columns of the smoother added."""
     smoothed = {}
     for name, kept in replays.items():
         trajectory = processor.trajectories[name]

@@ -1,6 +1,6 @@
-"""Verdict on a run: the figures that the terminal, the report, JSON and Python show under the same names.
+"""Verdict on a run: figures that have the same names on the terminal, in the report, in JSON and in Python.
 
-`judge_run` reads all figures from the record of the run (``run.json``), so that they agree everywhere.
+`judge_run` reads all figures from the record of the run (``run.json``), so that the same values appear everywhere.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ _PROMISED: Final = ("tracking", "coasting")
 
 @dataclass(frozen=True, kw_only=True)
 class PositionFigures:
-    """Figures of the filtered or single-epoch positions of an antenna; None if a figure does not exist."""
+    """Figures of an antenna's filtered or single-epoch positions. A figure that does not exist is None."""
 
-    epochs: int  #: For the filter, the number of all epochs; for single epochs, the number of epochs with observations.
+    epochs: int  #: Number of epochs; for single epochs, only those with observations.
     positions: int  #: Number of epochs with a position.
-    passed: int  #: Number of epochs with status `ok`, or, for the filter, `tracking` or `coasting`.
-    statuses: Mapping[str, int]  #: Number of epochs of each occurring status, the most frequent first.
+    passed: int  #: Number of epochs with the status `ok` (filter: `tracking` or `coasting`).
+    statuses: Mapping[str, int]  #: Number of epochs by status, most frequent first.
     chainage_first_m: float | None  #: Smallest chainage [m].
     chainage_last_m: float | None  #: Largest chainage [m].
     sigma_p50_m: float | None  #: Median standard deviation along the line [m].
@@ -45,7 +45,7 @@ class AntennaVerdict:
 
     antenna: str
     level_name: str  #: "protection level", or "indicative protection level" if the fault priors are assumed.
-    filter: PositionFigures | None  #: Figures of the filter along the track; None if it was off.
+    filter: PositionFigures | None  #: Figures of the along-track filter; None if the filter was off.
     single_epochs: PositionFigures
 
     @property
@@ -55,12 +55,12 @@ class AntennaVerdict:
 
     @property
     def is_usable(self) -> bool:
-        """Whether any position lies on the map."""
+        """Whether there is a filtered position, or, without the filter, a position that is not off the map."""
         off_map = 0 if self.filter is not None else self.leading.statuses.get(Status.OFF_MAP.text, 0)
         return self.leading.positions > off_map
 
     def figures(self) -> Iterator[tuple[str, str, str]]:
-        """Yield name, value of `leading`, and single-epoch value ("" if the filter was off) of each figure."""
+        """Yield the name of each figure, its `leading` value, and its single-epoch value ("" if the filter was off)."""
         texts: dict[str, Callable[[PositionFigures], str]] = {
             POSITIONS: lambda of: f"{count(of.positions)} of {count(of.epochs)}",
             PASSED: lambda of: f"{count(of.passed)} of {count(of.epochs)}",
@@ -88,7 +88,7 @@ class Verdict:
         return [*self._figure_lines(), *self._cause_lines()]
 
     def failure(self) -> str:
-        """Return the message on a run without any usable position: the cause, or notes on the map, then the figures."""
+        """Return the message on a run without usable positions: likely cause or notes on the map, then the figures."""
         of_map = [note for note in self.notes if ": the map " in note]
         return "; ".join(["no position can be used", *(self._cause_lines() or of_map), *self._figure_lines()])
 
@@ -105,7 +105,7 @@ class Verdict:
 
 
 def judge_run(record: Mapping[str, Any]) -> Verdict:
-    """Return the verdict on a run from its record; figures that a record of an earlier version lacks are None."""
+    """Return the verdict on a run, given its record. Figures that a record of an earlier version lacks are None."""
     level_name = f"{level_basis(record)} level"
     antennas = []
     for name, facts in (record.get("antennas") or {}).items():
@@ -125,7 +125,7 @@ def judge_run(record: Mapping[str, Any]) -> Verdict:
 
 
 def _figures(facts: Mapping[str, Any], promised: Sequence[str]) -> PositionFigures:
-    """Return the figures of an antenna or its filter; `promised` are the statuses of positions that passed."""
+    """Return the figures of an antenna or its filter. `promised` are the statuses that mean a passed check."""
     statuses = Counter({word: epochs for word, epochs in facts["status"].items() if epochs})
     chainage, sigma, level = (facts.get(name) or {} for name in ("chainage_m", "along_sigma_m", "level"))
     return PositionFigures(

@@ -1,7 +1,7 @@
 """Probability of each track of a network from logs of a train at rest.
 
 A train that was switched off on a known track and has not moved since is still on that track. A cold-movement detector
-or the odometer measures the distance moved; each misses a movement with a given probability.
+or the odometer measures the distance moved. It may miss a movement with a specified probability.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ from railfix.track.frames import in_map_frame
 from railfix.track.network import Network
 from railfix.track.network_read import read_network
 
-#: Largest distance moved, due to wheel creep and coupler slack, for which the train counts as not moved [m].
+#: Largest measured distance of a train that is assumed not to have moved (wheel creep, coupler slack) [m].
 _SAME_PLACE_M: Final = 1.0
-#: Part of the odometer's error bound that is proportional to the distance moved, as a fraction of this distance.
+#: Proportional part of the assumed odometer error bound, as a fraction of the distance moved.
 _ODOMETER_SHARE: Final = 0.05
-#: Constant part of the odometer's error bound [m].
+#: Constant part of the assumed odometer error bound [m].
 _ODOMETER_M: Final = 10.0
-#: Distance of the code position from the most likely track, in standard deviations, above which a note is issued.
+#: A note is issued if the code position is farther from the most likely track than this [standard deviations].
 _NOTED_MISFIT: Final = 2.5
 #: Minimum probability of an unmapped track.
 _LEAST_UNMAPPED: Final = 1e-9
@@ -65,10 +65,10 @@ def write_last_place(posterior: TrackPosterior, time: np.datetime64, path: Path)
 def prior_of_last_place(
     path: Path, network: Network, *, moved_m: float, missed_move: float, unmapped: float
 ) -> TrackPrior:
-    """Return the prior of tracks from the file written by `write_last_place` and the distance moved since then [m].
+    """Return the track prior, given the file written by `write_last_place` and the distance moved since then [m].
 
-    `missed_move` is the probability that the train was moved to any track unnoticed; `unmapped` is the prior of an
-    unmapped track in that case. Raise InputFileError if the file has no probabilities of tracks of this network.
+    `missed_move` is the probability that the train was moved unnoticed, to any track. `unmapped` is the prior of an
+    unmapped track in that case. Raise InputFileError if the file has no track probabilities for this network.
     """
     record = read_json_object(path, what="the last position of a train")
     stated = record.get("probability")
@@ -95,7 +95,7 @@ def prior_of_last_place(
 
 
 def _find_reachable(network: Network, track: int, within_m: float) -> list[str]:
-    """Return the names of the tracks that can be reached from a track within a distance, with reversals allowed."""
+    """Return the names of the tracks that a train on `track` can reach within a distance, reversals included."""
     near = nx.multi_source_dijkstra_path_length(
         network.graph.to_undirected(as_view=True), {4 * track + k for k in range(4)}, cutoff=within_m
     )
@@ -103,9 +103,9 @@ def _find_reachable(network: Network, track: int, within_m: float) -> list[str]:
 
 
 def prior_of_interlocking(text: str, network: Network) -> dict[str, float]:
-    """Parse the interlocking's track weights ``NAME=WEIGHT,...``; unnamed tracks are absent from the result.
+    """Parse the interlocking's track weights ``NAME=WEIGHT,...``. The result has only the named tracks.
 
-    Raise SettingsError if the text has another form, names a track that is not in the map, or has weights of 0 only.
+    Raise SettingsError if the text has another form or names a track that is not in the map, or if all weights are 0.
     """
     weights = {}
     for pair in text.split(","):
@@ -123,19 +123,19 @@ def prior_of_interlocking(text: str, network: Network) -> dict[str, float]:
     return weights
 
 
-#: Distance from the train within which a track is a hypothesis [m].
+#: Tracks within this distance of the train are hypotheses [m].
 _NEAR_M: Final = 60.0
-#: Distance from the train within which the points of a hypothesis are used [m].
+#: Track points within this distance of the train are used [m].
 _POINTS_M: Final = 400.0
-#: Maximum number of tracks that are hypotheses.
+#: Maximum number of hypotheses.
 _MOST_TRACKS: Final = 64
 
 
 def yard_tracks(network: Network, origin_ecef_m: Floats) -> list[YardTrack]:
-    """Return the tracks of a network near a position, with points relative to the position.
+    """Return the tracks of a network near a position, with their points relative to the position.
 
-    `origin_ecef_m` is in the frame of the network. Tracks within 60 m of the position are returned, with their points
-    within 400 m. Raise MismatchError if no track is within 60 m.
+    The position `origin_ecef_m` is in the frame of the network. Tracks within 60 m of it are returned, with their
+    points within 400 m of it. Raise MismatchError if no track is within 60 m.
     """
     latitude, longitude, height = (float(v) for v in geodetic_from_ecef(origin_ecef_m))
     near = network.near(np.array([latitude]), np.array([longitude]), within_m=_NEAR_M, most=_MOST_TRACKS)
@@ -163,10 +163,10 @@ def yard_tracks(network: Network, origin_ecef_m: Floats) -> list[YardTrack]:
 
 @dataclass(frozen=True, kw_only=True)
 class TrackDecision:
-    """Decision on the track of a train at rest, with the posterior at each of L evaluations.
+    """Decision on the track of a train at rest, with the posterior probabilities at each of L evaluations.
 
-    `seconds`, shape (L,), is the time at rest at each evaluation [s]. `track` is the name of a track, ``"none"`` for an
-    unmapped track, or ``"undecided"``; `decided_s` is the time at rest at the decision [s], NaN if undecided. `end` is
+    `seconds` is the time at rest at each evaluation, shape (L,) [s]. `track` is the name of a track, ``"none"`` for an
+    unmapped track, or ``"undecided"``. `decided_s` is the time at rest at the decision [s], NaN if undecided. `end` is
     the last epoch.
     """
 
@@ -189,11 +189,11 @@ def decide_track(
     every_s: float = 10.0,
     prior: Mapping[str, float] | None = None,
 ) -> TrackDecision:
-    """Evaluate the posterior repeatedly and decide when the probability of all other tracks is below `risk`.
+    """Evaluate the posterior repeatedly, and decide for a track when the probability of all others is below `risk`.
 
-    `tracks`, `arms_m`, `errors` and `prior` are as for `track_posterior`; the positions of all `antennas` refer to the
-    same origin. The first evaluation is after `least_s` [s], and the interval of evaluations is `every_s` [s]. A log
-    shorter than `least_s` is evaluated once, without a decision. Raise MismatchError if there is no position.
+    `tracks`, `arms_m`, `errors` and `prior` are as in `track_posterior`. All `antennas` must have the same origin. The
+    first evaluation is after `least_s` [s]; further evaluations follow every `every_s` [s]. A log shorter than
+    `least_s` is evaluated once, without a decision. Raise MismatchError if there is no position.
     """
     start = max(codes.time[0] for codes in antennas)
     length = float((min(codes.time[-1] for codes in antennas) - start) / np.timedelta64(1, "s"))
@@ -246,8 +246,8 @@ class WhichTrackInputs(InputFiles):
 class WhichTrackOptions(Settings):
     """Options of `railfix which-track`.
 
-    With `same_frame`, the base station's position is in the frame of the map. The position of the train is then in this
-    frame, too, because it is computed relative to the base station.
+    With `same_frame`, the base station's position is in the frame of the map. The train's position, which is computed
+    relative to the base station, is then in the same frame.
     """
 
     spacing: float = option("Distance from the rear to the front antenna along the train.", 0.0, metavar="M", ge=0)
@@ -281,7 +281,7 @@ class WhichTrackOptions(Settings):
 def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, config: Config) -> TrackDecision:
     """Decide on which track a train at rest is, from its logs and a map.
 
-    Raise a RailfixError (`railfix.core.errors`) if an option or a file is unusable, or the train moves.
+    Raise a RailfixError (`railfix.core.errors`) if an option or a file is unusable, or if the train moves.
     """
     inputs.check_files()
     if (not inputs.base) != (options.base_place is None):
@@ -349,7 +349,7 @@ def _observations(paths: tuple[Path, ...], options: WhichTrackOptions) -> Observ
 
 
 def _prior(inputs: WhichTrackInputs, options: WhichTrackOptions, network: Network) -> TrackPrior:
-    """Return the product of each track's weights (`--last`, `--prior`), and the prior of an unmapped track."""
+    """Return the weight of each track (product of `--last` and `--prior`), and the prior of an unmapped track."""
     weights, unmapped = dict.fromkeys(network.names, 1.0), options.errors.unmapped_prior
     if inputs.last is not None and options.moved is not None:
         weights, unmapped = prior_of_last_place(
