@@ -59,7 +59,7 @@ def test_an_ensemble_and_a_frame_of_another_name_say_what_they_are_taken_for() -
     assert "taken as ETRF2020" in points_at(place, "EPSG:4258", TIME)[1].notes[0]
     assert points_at(place, "EPSG:9069", TIME)[1].notes == ()
     there = ecef_from_geodetic(np.array([40.0]), np.array([-105.0]), np.array([0.0]))
-    assert "taken as NAD83(2011); it differs by up to 0.1 m" in points_at(there, "EPSG:4957", TIME)[1].notes[0]
+    assert "taken as NAD83(2011); the frames differ by up to 0.1 m" in points_at(there, "EPSG:4957", TIME)[1].notes[0]
     assert "latest realisation, which is ITRF2020" in points_at(place, "EPSG:4326", TIME)[1].method
 
 

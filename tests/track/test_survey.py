@@ -154,7 +154,7 @@ def test_a_branch_is_reported_and_left_out() -> None:
     runs = [run_over(line, np.arange(0.0, 2099.0, 10.0), 8), run_over(branch, np.arange(0.0, 1190.0, 10.0), 9)]
     survey = survey_line(runs)
     assert survey.track.chainage_m[-1] == pytest.approx(2099.0, rel=0.015)
-    assert any("do not lie on the line" in note for note in survey.track.provenance.notes)
+    assert any("are off the line" in note for note in survey.track.provenance.notes)
     assert survey.beside_m > 300.0
 
 

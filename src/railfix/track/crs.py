@@ -144,11 +144,11 @@ SAME: Final = {
         "EPSG:8254",
         "its versions 2 to 8 differ by up to 0.03 m in plan where the crust is stable, 0.10 m in height",
     ),
-    "NAD83(HARN)": ("EPSG:6319", "it differs by up to 0.1 m, 0.5 m in the west of California"),
-    "NAD83(FBN)": ("EPSG:6319", "it differs by up to 0.1 m, 0.5 m in the west of California"),
-    "NAD83(NSRS2007)": ("EPSG:6319", "it differs by 0.02 m, up to 0.3 m in the west of California"),
-    "RGF93 v2": ("EPSG:7931", "it is that frame at 2009.0"),
-    "RGF93 v2b": ("EPSG:7931", "it is that frame at 2019.0"),
+    "NAD83(HARN)": ("EPSG:6319", "the frames differ by up to 0.1 m, by up to 0.5 m in the west of California"),
+    "NAD83(FBN)": ("EPSG:6319", "the frames differ by up to 0.1 m, by up to 0.5 m in the west of California"),
+    "NAD83(NSRS2007)": ("EPSG:6319", "the frames differ by 0.02 m, by up to 0.3 m in the west of California"),
+    "RGF93 v2": ("EPSG:7931", "it is this frame at the epoch 2009.0"),
+    "RGF93 v2b": ("EPSG:7931", "it is this frame at the epoch 2019.0"),
 }
 
 

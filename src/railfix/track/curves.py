@@ -20,8 +20,8 @@ from railfix.core.geodesy import axes_at
 from railfix.track.track import Track
 from railfix.track.trajectory import Trajectory
 
-#: Largest accepted difference between a chord's middle ordinate from the map's radius and from neighbouring points [m].
-#: At a larger difference the radius is not used, because it belongs to another point or has the wrong sign.
+#: Largest accepted difference between a chord's middle ordinates from the map's radius and from neighbouring points
+#: [m]. A radius with a larger difference is for another point or has the wrong sign, and is not used.
 _AGREES_M: Final = 0.03
 _CORNER_RAD: Final = 0.25  #: Change of direction above which a point is a corner, which the curve does not round [rad].
 #: Minimum distance of a ramp's end from the points before and after it, as a fraction of the distance between these

@@ -77,8 +77,8 @@ class Thinned:
 def stationary(time: Datetimes, ecef_m: Floats, *, speed_mps: float, window_s: float) -> Masks:
     """Return a mask of the rows at which the antenna is stationary, shape (T,).
 
-    A row is stationary if the horizontal displacement within `window_s` before and after it is less than `speed_mps`
-    times the duration. Times must rise. If a time is NaT, no row is stationary.
+    A row is stationary if the horizontal displacement, from `window_s` before it to `window_s` after it, is less than
+    `speed_mps` times the elapsed time. Times must rise. If a time is NaT, no row is stationary.
     """
     if len(time) < 3 or np.isnat(time).any() or speed_mps == 0.0:
         return np.zeros(len(time), dtype=np.bool_)
@@ -358,7 +358,7 @@ def usable_rows(log: PositionLog, *, quality: Sequence[int] | None = None, max_s
         if not usable.any():
             accepted = " or ".join(map(str, wanted))
             message = (
-                f"no position has quality {accepted}; the log has {qualities_in_words(log)} (--quality takes others)"
+                f"no position has quality {accepted}; the log has {qualities_in_words(log)} (--quality accepts others)"
             )
             raise NoPositionError(f"{log.path}: {message}")
     if max_sigma_m is not None:

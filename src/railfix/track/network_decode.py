@@ -55,8 +55,7 @@ _SLACK_M: Final = 30.0
 _SLACK_SHARE: Final = 0.2
 #: Excess of the path length over the straight distance that halves the transition probability over joints [m].
 _PASSING_M: Final = 5.0
-#: Cost of a change of track in the returned sequence, in the unit of its gain: expected pairs of successive positions
-#: on correct tracks.
+#: Cost of a change of track in the returned sequence. The unit is one pair of successive positions on correct tracks.
 _CHANGE: Final = 0.5
 #: Cost of a change of track at a joint; smaller, because a short track in a switch has only one or two positions.
 _CHANGE_AT_JOINT: Final = 0.05
@@ -146,7 +145,7 @@ class Transitions:
         share[m:-1, :m] = np.where(entered, np.exp(-_OPEN_COST), np.exp(-_ENTER_BESIDE_COST))
         share[:m, :m] = np.where(same, 1.0, np.exp(-_JUMP_COST))
         share[m:-1, m:-1] = _shifted(float(self._moved[k + 1]), bool(self._turned[k + 1]))
-        # a part of an unmapped track can be parallel to a mapped track
+        # an unmapped track can be parallel to a mapped track on a part of its length
         share[-1, m:-1], share[m:-1, -1] = UNMAPPED_PRIOR * free, UNMAPPED_PRIOR * np.exp(-_ENTER_COST)
         for i, j in np.argwhere(self._leaves[k][:, None] & self._enters[k] & ~same).tolist():
             way = self._way(k, i, j)
@@ -199,7 +198,7 @@ def _shifted(moved_m: float, turned: bool) -> Floats:
 
 @lru_cache(maxsize=256)
 def _urn(balls: int, seconds: float) -> tuple[Floats, Floats]:
-    """Return the equilibrium probabilities of an urn's states, and its transition matrix (row to column)."""
+    """Return the equilibrium probabilities of an urn's states, and the transition matrix over `seconds`."""
     change = 0.5 * (1.0 - np.exp(-seconds / COMMON_S))
     passages = [
         np.convolve(_binomial(inside, 1.0 - change), _binomial(balls - inside, change)) for inside in range(balls + 1)

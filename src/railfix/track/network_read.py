@@ -330,7 +330,7 @@ def _too_near(network: Network) -> Iterator[NetworkFinding]:
         places = network.chainage_m[[k for k, _ in points]]
         if a < b and places.max() - places.min() >= _LEAST_WAY_M:
             sentence = (
-                f"{{0}} and {{1}} are {min(d for _, d in points):.2f} m apart over "
-                f"{places.max() - places.min():.0f} m away from their ends; check whether a track is in the map twice"
+                f"{{0}} and {{1}} are {min(d for _, d in points):.2f} m apart on "
+                f"{places.max() - places.min():.0f} m of their length; check whether a track is in the map twice"
             )
             yield _finding(network, "too near", (a, b), points[0][0] - int(network.first_point[a]), sentence)

@@ -21,7 +21,7 @@ from railfix.track.geometry import Geometry, compute_geometry, mean_gradients
 from railfix.track.track import BACKWARDS, HEIGHTS_M, Track, kilometrage_breaks
 
 Severity = Literal["error", "warning"]
-_COARSE_DEG: Final = 1e-5  #: Rounding step of coordinates that is reported; rounding errors reach 0.6 m [deg].
+_COARSE_DEG: Final = 1e-5  #: Step of coordinates that count as rounded [deg]; it causes errors of up to 0.6 m.
 _LEAST_CANT_M: Final = 5e-4  #: If the largest cant of a map is below this value, the unit must be wrong [m].
 _NEAR_DUPLICATE_M: Final = 0.10  #: Spacing below which two points are reported as one point measured twice [m].
 _CURVED_1PM: Final = 1 / 3000  #: Curvature below which the track counts as straight [1/m].

@@ -53,7 +53,7 @@ def read_track(
     name : str, optional
         Name of the route; by default the name in the file, otherwise the file name.
     max_gap_m : float [m]
-        Widest gap between the ends of two segments that is bridged.
+        Widest gap between two segments that is bridged.
     sigma_plan_m, sigma_height_m : float, optional [m]
         Standard deviations of the map in plan and in height; by default the values stated in the file or, if the file
         states none, 0.30 m and 0.60 m (P1 4.1(3)).

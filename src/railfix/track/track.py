@@ -19,14 +19,14 @@ from railfix.core.notebook import NotebookTable, plural
 
 SIGMA_PLAN_M = 0.30  #: Standard deviation of an aerial survey's centreline in plan [m] (P1 4.1(3)).
 SIGMA_HEIGHT_M = 0.60  #: Standard deviation of the centreline's height, about twice `SIGMA_PLAN_M` [m] (P1 4.1(3)).
-#: Text after the name of a section in the note that its points are joined in reverse order.
+#: Note on a section that is joined in reverse order, without the section's name.
 BACKWARDS = "is used against the order of its points"
 UNNAMED = "not named (WGS 84 assumed)"  #: `Provenance.crs` of a map that names no reference system.
 #: The kilometrage has a break in a segment if its change and the length of the segment differ by more than this value
 #: plus a twentieth of the length [m].
 KILOMETRAGE_BREAK_M = 1.0
 HEIGHTS_M = (-1000.0, 9000.0)  #: Range of accepted ellipsoidal heights, including tunnels below the sea [m].
-ANOTHER_PLACE_M = 100_000.0  #: Distance of a log from a map above which they are of different regions [m].
+ANOTHER_PLACE_M = 100_000.0  #: Distance between a log and a map above which they are of different regions [m].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,11 +65,11 @@ class Track(NotebookTable):
     latitude_deg: Floats  #: Geodetic latitude in `Provenance.frame`, shape (V,).
     longitude_deg: Floats  #: Longitude in `Provenance.frame`, shape (V,).
     height_m: Floats  #: Ellipsoidal height of the middle between the rail tops, shape (V,).
-    #: Kilometrage of the line, shape (V,); it may jump or decrease; NaN where the map has none.
+    #: Kilometrage of the line, shape (V,). It may jump or decrease, and is NaN where unknown.
     kilometrage_m: Floats
-    cant_m: Floats  #: Height of the outer rail above the inner rail, shape (V,); NaN where the map has none.
-    #: Horizontal radius, positive in a curve to the right in the direction of rising chainage, infinite on straight
-    #: track, NaN where the map has none; shape (V,).
+    cant_m: Floats  #: Height of the outer rail above the inner rail, shape (V,); NaN where unknown.
+    #: Horizontal radius, shape (V,), positive in a right curve, seen toward rising chainage. The radius is infinite on
+    #: straight track, and NaN where unknown.
     radius_m: Floats
     gradient_permille: Floats  #: Gradient, positive if the line rises with chainage; NaN if unknown; shape (V,).
     section: Integers  #: Index of each point's section in `sections`, shape (V,).

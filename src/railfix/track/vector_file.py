@@ -203,7 +203,7 @@ def read_overpass(path: str, elements: Any) -> list[Way]:
 def _place(path: FilePath, lon: Any, lat: Any) -> tuple[float, float]:
     for text in (lon, lat):
         if "," in str(text):
-            raise InputFileError(path, f"{text}: has a comma in a number; a decimal point was expected")
+            raise InputFileError(path, f"{text} has a comma in a number; a decimal point was expected")
     try:
         return float(lon), float(lat)
     except (TypeError, ValueError):

@@ -211,8 +211,8 @@ def _of_rows(weight: Floats, run: SurveyRun) -> Floats:
 
 
 _ROUNDS: Final = 3  #: Number of adjustments with the line. The passes are searched before each adjustment.
-#: Distance between the passes of both directions beyond which they are treated as separate tracks, in standard
-#: deviations of a run's offset. The factor is three standard deviations of the difference of two offsets.
+#: Distance between the passes of both directions beyond which the directions count as separate tracks, in standard
+#: deviations of a run's offset. The value is three standard deviations of the difference of two offsets.
 _OTHER_TRACK: Final = 3.0 * 2.0**0.5
 _TURN_M: Final = 40.0  #: Distance over which a reversal is searched [m].
 _END_POINTS: Final = 8  #: Number of points from which the direction at an end of the line is computed.
@@ -412,12 +412,10 @@ def _notes(
             "height are assumed for this error in the accuracy of the map; add runs of other days"
         )
     if beside > 0.02 * driven:
-        notes.append(
-            f"{beside:,.0f} m of the runs do not lie on the line and are not used: branches, or wrong positions"
-        )
+        notes.append(f"{beside:,.0f} m of the runs are off the line and are not used: branches, or wrong positions")
     if apart:
         notes.append(
-            f"the runs of one direction lie {apart:.1f} m beside the runs of the other direction: they are taken to be "
-            "on another track, and are left out; survey each track separately"
+            f"the runs of one direction, {apart:.1f} m beside the runs of the other direction, are assumed to be on "
+            "another track, and are left out; survey each track separately"
         )
     return tuple(notes)

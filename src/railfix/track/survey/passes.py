@@ -331,8 +331,8 @@ def without_other_track(
 ) -> tuple[list[Pass], float]:
     """Remove the passes of one direction if both directions are on separate tracks.
 
-    Return the passes of the more frequent direction and the distance between the tracks [m]. If the tracks are at most
-    `tolerance_m` apart, return all passes and 0.
+    Tracks are separate if they are more than `tolerance_m` apart. Return the remaining passes and the distance between
+    the tracks [m], which is 0 if no passes are removed.
     """
     across: dict[int, Floats] = {}
     for sign in (1, -1):

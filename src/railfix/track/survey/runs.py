@@ -35,8 +35,8 @@ class SurveyLimits(Settings):
     #: Correlation time of position errors.
     correlation_s: float = Field(default=30.0, ge=0)
     correlation_m: float = Field(default=50.0, ge=0)  #: Correlation length of position errors along the path.
-    #: Standard deviation of the change of horizontal velocity per axis in one second. Three road vehicles had changes
-    #: of 1.2 to 1.8 m/s, times the square root of the time [s], over 5 s, the duration of curves and braking.
+    #: Standard deviation of the change of horizontal velocity per axis in one second. It was 1.2 to 1.8 m/s for three
+    #: road vehicles, computed from changes over 5 s, the duration of curves and braking.
     acceleration_mps2: float = Field(default=1.5, gt=0)
     freedom: float = Field(default=3.0, gt=0)  #: Degrees of freedom of Student's t, which down-weights outliers.
     same_line_m: float = option(
