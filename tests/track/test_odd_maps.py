@@ -67,7 +67,7 @@ def test_an_odd_map_is_right_or_says_what_is_wrong(case: odd.Odd, tmp_path: Path
     if case.outcome == "found":
         assert any(re.search(case.words, sentence) for sentence in findings), findings
     elif case.outcome == "elsewhere":
-        with pytest.raises(MismatchError, match=case.words or "whether it is the map of that line"):
+        with pytest.raises(MismatchError, match=case.words or "whether the map is of this line"):
             log_at(odd.LINE[:, 1], odd.LINE[:, 0]).transform_to(
                 Network(tracks=tuple(read_segments(path, MapReading(**asked))), links=())
             )

@@ -255,7 +255,7 @@ def _check_area(crs: str, latitude_deg: Floats, longitude_deg: Floats, *, path: 
     finite = np.isfinite(latitude_deg) & np.isfinite(longitude_deg) & (np.abs(latitude_deg) <= 90.0)
     if not finite.all():
         raise InputFileError(
-            path, f"some coordinates lie outside the CRS {crs}; give the right CRS (--crs), in the unit of the file"
+            path, f"some coordinates are outside the CRS {crs}; give the right CRS (--crs), in the unit of the file"
         )
     geodetic = get_geodetic_frame(crs)
     outside, area = ~is_in_area(geodetic, latitude_deg, longitude_deg, margin_deg=MARGIN_DEG), geodetic.area_of_use

@@ -210,7 +210,7 @@ def _from_positions(track: Track, log: PositionLog, sigma_m: float | None, *, re
     segment, along, offset = plan(ecef_from_geodetic(latitude, longitude, np.zeros(len(log))))
     near = np.isfinite(offset) & (offset < _NEAR_M)
     if near.sum() < 2:
-        raise InputFileError(log.path, f"{int(near.sum())} of {len(log)} positions lie within {_NEAR_M:g} m of the map")
+        raise InputFileError(log.path, f"{int(near.sum())} of {len(log)} positions are within {_NEAR_M:g} m of the map")
     by_quality = np.array([SIGMA_OF_QUALITY.get(int(q), SIGMA_OF_QUALITY[5])[1] for q in log.quality])
     sigma = np.where(np.isfinite(log.sigma_m[:, 2]), np.maximum(log.sigma_m[:, 2], by_quality), by_quality)
     place = (track.chainage_m[segment] + along)[near]
@@ -229,7 +229,7 @@ def _from_positions(track: Track, log: PositionLog, sigma_m: float | None, *, re
         )
     note = (
         f"heights of the antenna positions {log.path}, sigma {spread:.2f} m: use the map without a vehicle file, or "
-        "lower its heights by the height of that antenna"
+        "lower its heights by the height of the antenna"
     )
     return _replace(track, EllipsoidalHeights(height_m=fitted, datum="ellipsoidal"), spread, note)
 

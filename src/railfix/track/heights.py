@@ -84,7 +84,7 @@ def geoid_heights(geoid: str | CRS, place: Georeference, *, path: str) -> GeoidM
         i = int(np.argmax(outside))
         raise InputFileError(
             path,
-            f"{int(outside.sum())} of {len(outside)} points lie outside the geoid {model.name}, the first at latitude "
+            f"{int(outside.sum())} of {len(outside)} points are outside the geoid {model.name}, the first at latitude "
             f"{place.latitude_deg[i]:.6f}, longitude {place.longitude_deg[i]:.6f}; give the geoid of the country, or "
             "check whether latitude and longitude are swapped",
         )

@@ -179,7 +179,7 @@ def _read_plans(path: str, elements: list[Any], scale: float, crs: str | None) -
             )
     else:
         chosen = int(broken[1] < broken[0])
-    notes = (f"{path}: the file has easting before northing, against LandXML 1.2",) if chosen else ()
+    notes = (f"{path}: the file has easting before northing, contrary to LandXML 1.2",) if chosen else ()
     return plans[chosen], notes
 
 

@@ -106,11 +106,11 @@ def _check_region(network: Network, log: PlanLog) -> None:
     turned = ecef_from_geodetic(np.clip(longitude, -90.0, 90.0), latitude, zeros)
     swapped = float(np.min(tree.query(turned)[0])) <= ANOTHER_PLACE_M
     what = (
-        "latitude and longitude are swapped in one of them"
+        "latitude and longitude are swapped in the map or the log"
         if swapped
-        else "check whether it is the map of that line and its CRS is right"
+        else "check whether the map is of this line, and its CRS is right"
     )
-    raise MismatchError(f"{log.path}: the map lies {apart / 1000.0:.0f} km from where the log was recorded; {what}")
+    raise MismatchError(f"{log.path}: the map is {apart / 1000.0:.0f} km away from the positions of the log; {what}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -226,7 +226,7 @@ def _sigma(network: Network, log: PlanLog, given: Indices, sigma_m: float | None
     if stated.all():
         return sigma, ()
     estimate, how = _estimate_sigma(network, log, given[~stated])
-    note = f"{log.path}: {int((~stated).sum())} positions state no sigma, {estimate:.1f} m is assumed{how} (--sigma)"
+    note = f"{log.path}: {int((~stated).sum())} positions have no sigma, {estimate:.1f} m is assumed{how} (--sigma)"
     return np.where(stated, sigma, estimate), (note,)
 
 
@@ -255,7 +255,7 @@ def _time_notes(log: PlanLog, given: Indices) -> tuple[str, ...]:
     if not len(back):
         return ()
     first = log.time[given[back[0] + 1]]
-    return (f"{log.path}: the time decreases at {len(back)} rows, first to {first}; the order of the rows is kept",)
+    return (f"{log.path}: the time decreases at {len(back)} rows, first at {first}; the order of the rows is kept",)
 
 
 def _candidates(network: Network, latitude_deg: Floats, longitude_deg: Floats, within_m: float) -> Candidates:

@@ -81,7 +81,7 @@ def _lines(path: str, node: dict[str, Any], label: str, inherited: dict[str, Any
     else:
         where = f"{label}: " if label else ""
         raise InputFileError(
-            path, f"{where}type {kind!r}; LineString or MultiLineString (or features of them) expected"
+            path, f"{where}type {kind!r}; LineString or MultiLineString (or features of them) was expected"
         )
 
 
@@ -121,7 +121,7 @@ class _GeojsonLine:
             raise self.error("a track needs at least two points")
         sizes = {len(point) if isinstance(point, list) else 0 for point in coordinates}
         if sizes != {2} and not sizes <= {3, 4}:
-            raise self.error("every point must be [longitude, latitude, height], or every one without a height")
+            raise self.error("all points must be [longitude, latitude, height], or all must be without a height")
         try:
             values = np.array([point[:3] for point in coordinates], dtype=np.float64)
         except (TypeError, ValueError):
@@ -376,14 +376,14 @@ def check_degrees(table: NamedColumns, latitude_deg: Floats, longitude_deg: Floa
         value = latitude_deg[row]
         hint = "check whether latitude and longitude are swapped"
         if abs(value) > 360.0:
-            hint = "degrees were expected, not metres of a grid (read from GeoJSON), minutes or seconds"
+            hint = "degrees were expected, not minutes, seconds or metres of a grid (grids are read from GeoJSON)"
         raise table.error(row, f"latitude_deg {value:g} is over 90; {hint}")
     outside = np.abs(longitude_deg) > 360.0
     if outside.any():
         row = int(np.argmax(outside))
         raise table.error(row, f"longitude_deg {longitude_deg[row]:g} is over 360; degrees were expected")
     if len(table) and (np.abs(latitude_deg) <= np.pi / 2).all() and (np.abs(longitude_deg) <= np.pi).all():
-        raise table.error(0, "all coordinates lie within a few degrees of 0, 0: radians were given, degrees expected")
+        raise table.error(0, "all coordinates are near 0, 0: radians were given, degrees were expected")
 
 
 def _place(crs: str | None, latitude: Floats, longitude: Floats, *, path: str) -> Georeference:

@@ -186,7 +186,7 @@ def read_overpass(path: str, elements: Any) -> list[Way]:
     not valid or there is no railway way.
     """
     if not isinstance(elements, list) or not all(isinstance(e, dict) for e in elements):
-        raise InputFileError(path, "elements is not a list of objects, as Overpass writes them")
+        raise InputFileError(path, "'elements' is not a list of objects, as in Overpass files")
     nodes = {str(e["id"]): _place(path, e.get("lon"), e.get("lat")) for e in elements if e.get("type") == "node"}
     crossings = {str(e["id"]) for e in elements if e.get("type") == "node" and _is_crossing(e.get("tags") or {})}
     ways = []

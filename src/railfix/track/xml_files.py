@@ -105,7 +105,7 @@ def read_railml_relations(path: FilePath) -> list[Relation]:
         try:
             ends = [int(float(str(item.get(key)))) for key in ("positionOnA", "positionOnB")]
         except ValueError:
-            what = f"netRelation {item.get('id')} has no positionOnA and positionOnB, of 0 or 1"
+            what = f"netRelation {item.get('id')} must have positionOnA and positionOnB, each 0 or 1"
             raise InputFileError(path, what) from None
         relations.append(
             Relation(
