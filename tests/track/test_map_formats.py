@@ -355,7 +355,7 @@ def test_landxml_of_inframodel_is_read(tmp_path: Path) -> None:
 <CantStation station="260" appliedCant="0.150" curvature="cw"/></Cant></Alignment></Alignments></LandXML>"""
     )
     (segment,) = read_xml_segments(path, MapReading(height_datum="ellipsoidal"))
-    assert any("at most 0.15 in the file; assumed in its unit of length" in note for note in segment.notes)
+    assert any("at most 0.15, assumed in the length unit of the file" in note for note in segment.notes)
     assert not any("do not meet" in note for note in segment.notes)
     assert segment.cant_m[-1] == pytest.approx(0.150)
     assert segment.radius_m[-1] == pytest.approx(800.0)

@@ -291,9 +291,8 @@ class Operations:
     def describe_lacking(self, crs: str | None = None) -> str:
         """Return a clause on the best operation whose grids are not installed, and on how to get the grids.
 
-        The clause is empty if there is no such operation.
-
-        Operations whose grids can be downloaded by projsync are preferred; among these, the most accurate is the best.
+        The clause is empty if there is no such operation. The best operation is the most accurate one, with preference
+        for operations whose grids can be downloaded by projsync.
         """
         if not self.lacking:
             return ""

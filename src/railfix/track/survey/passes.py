@@ -81,7 +81,7 @@ class Course:
 
 @dataclass(frozen=True, kw_only=True)
 class Pass:
-    """Part of a leg that is on the line, sampled at p positions."""
+    """Part of a leg on the line, sampled at p positions."""
 
     leg: int  #: Index of the leg.
     sign: int  #: 1 in the direction of the line, -1 in the opposite direction.
@@ -102,9 +102,8 @@ def directions(point_m: Floats, *, closed: bool = False) -> Floats:
 def find_legs(run: int, point_m: Floats, time_s: Floats, limits: SurveyLimits, turn_m: float) -> list[Leg]:
     """Divide a run into legs at reversals and at gaps over which the run is not straight.
 
-    Reversals are searched over the distance `turn_m`.
-
-    Rows are left out if they are nearer to the previous selected row than the spacing.
+    Reversals are searched over the distance `turn_m`. Rows are left out if they are nearer to the previous selected row
+    than the spacing.
     """
     spacing_m = limits.spacing_m
     rows = [0]
