@@ -270,7 +270,7 @@ def alignment_points(
 ) -> tuple[AlignmentPoints, tuple[str, ...]]:
     """Compute points of an alignment, and notes on successive elements that do not meet.
 
-    The chords between the points are within 1 cm of the alignment. `at_m` are distances in plan of additional points [m].
+    The chords between points are within 1 cm of the alignment. `at_m` are distances in plan of additional points [m].
     """
     starts = plan_starts(plan)
     length = starts[-1] + plan[-1].length_m
