@@ -1,4 +1,4 @@
-"""Examination of model files in TOML and of scenarios, by the readers of the commands."""
+"""Examination of TOML files with models or scenarios."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from railfix.ranges.error_model import read_error_model
 
 ModelKind = Literal["C/N0 curve", "error model", "integrity support message", "scenario"]
 MODEL_KINDS: Final[tuple[ModelKind, ...]] = get_args(ModelKind)
-#: Kinds by the first words of the entry `format`, without the version.
+#: Kind of model file by the entry `format`, version excluded.
 _FORMATS: Final[dict[str, ModelKind]] = {
     CURVE_FORMAT.rpartition(" ")[0]: "C/N0 curve",
     ERROR_FORMAT.rpartition(" ")[0]: "error model",
@@ -24,7 +24,7 @@ _FORMATS: Final[dict[str, ModelKind]] = {
 }
 #: Top-level entries that only scenarios and recipes for several scenarios have.
 _OF_SCENARIO: Final = {"duration_s", "rate_hz", "line", "run", "runs", "sky", "receiver", "environment", "stations"}
-#: Options of `railfix run` that accept a model, without the path.
+#: Option of `railfix run` that accepts the model file, by kind.
 _OPTIONS: Final[dict[ModelKind, str]] = {
     "C/N0 curve": "--cn0-curve",
     "error model": "--error-model",
@@ -33,14 +33,14 @@ _OPTIONS: Final[dict[ModelKind, str]] = {
 
 
 def find_model_kind(path: Path) -> ModelKind | None:
-    """Return the kind of a TOML file from its entries; None for files of vehicles and settings."""
+    """Return the kind of a TOML file from its entries, or None for a vehicle or settings file."""
     values = read_toml(path, what="a TOML file")
     name = str(values.get("format", "")).rpartition(" ")[0]
     return _FORMATS.get(name) or ("scenario" if _OF_SCENARIO & values.keys() else None)
 
 
 def read_model_facts(path: Path, kind: ModelKind) -> str:
-    """Return a phrase on the content of a model file; raise the errors of the model's reader."""
+    """Return a phrase on the content of a model file. Errors of the model's reader are raised."""
     if kind == "scenario":
         return "input of railfix simulate; a run does not use it"
     if kind == "C/N0 curve":
@@ -54,7 +54,8 @@ def read_model_facts(path: Path, kind: ModelKind) -> str:
 
 
 def model_options(models: dict[ModelKind, Path]) -> list[str]:
-    """Return the options of `railfix run` for model files by kind; a scenario has no option."""
+    """Return the options of `railfix run` for model files by kind. Scenarios are omitted, because they have no
+    option."""
     options = {kind: _OPTIONS[kind] for kind in models if kind in _OPTIONS}
     texts = [f"{option}{'' if option.endswith('=') else ' '}{models[kind]}" for kind, option in options.items()]
     return [word for text in texts for word in text.split(" ", maxsplit=1)]
