@@ -330,7 +330,7 @@ CASES: Final[tuple[Odd, ...]] = (
         "refused", "station equations do not rise from the start",
     ),
     Odd("gap.xml", _landxml("650100</End></Line>", "650090</End></Line>"), "refused", "correct the elements"),
-    Odd("curve_turned.xml", _landxml('rot="cw"', 'rot="ccw"'), "refused", "curves turn to the side opposite"),
+    Odd("curve_turned.xml", _landxml('rot="cw"', 'rot="ccw"'), "refused", "curves do not match their attribute rot"),
     Odd("unknown_frame.xml", _landxml('"25832"', '"99999999"'), "refused", "'EPSG:99999999' is unknown"),
     Odd("frame_without_grid.xml", _landxml('"25832"', '"4258"'), "refused", "not a projected CRS"),
     Odd("another_grid.xml", _landxml('"25832"', '"2154"'), "refused", "whether EPSG:2154 is the right CRS"),

@@ -143,7 +143,7 @@ def test_the_track_beside_is_not_averaged_into_the_line(apart_m: float, other: b
     out, back = np.arange(0.0, 2090.0, 15.0), np.arange(2090.0, 0.0, -16.0)
     runs = [run_over(line, out, 1, sigma_m=1.0), run_over(line, out + 7.0, 2, sigma_m=1.0)]
     survey = survey_line([*runs, run_over(beside, back, 3, sigma_m=1.0)])
-    assert any("they are taken to be" in note for note in survey.track.provenance.notes) == other
+    assert any("are assumed to be on another track" in note for note in survey.track.provenance.notes) == other
     assert np.percentile(across_m(survey, line), 95) < 2.0
     assert (survey.beside_m > 1000.0) == other
 

@@ -275,7 +275,7 @@ def test_geojson_collection_and_multi_line_are_a_route(tmp_path: Path) -> None:
         ({"type": "Feature", "geometry": None}, "no geometry"),
         (feature([[1, 2], [3, 4]]), "no height"),
         (feature([[1, 50, 2]]), "at least two points"),
-        (feature([[1, 50, 2], [1, 51]]), "every point must be"),
+        (feature([[1, 50, 2], [1, 51]]), "all points must be"),
         (feature([[1, 50, 2], [1, "x", 3]]), "not a number"),
         (feature([[1, 50, 2], [1, None, 3]]), "not finite"),
         (feature(LINE, height_datum="levelled"), "expected 'ellipsoidal' or 'orthometric'"),
