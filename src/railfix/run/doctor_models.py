@@ -54,8 +54,7 @@ def read_model_facts(path: Path, kind: ModelKind) -> str:
 
 
 def model_options(models: dict[ModelKind, Path]) -> list[str]:
-    """Return the options of `railfix run` for model files by kind. Scenarios are omitted, because they have no
-    option."""
+    """Return the options of `railfix run` for model files. Scenarios are omitted, because they have no option."""
     options = {kind: _OPTIONS[kind] for kind in models if kind in _OPTIONS}
     texts = [f"{option}{'' if option.endswith('=') else ' '}{models[kind]}" for kind, option in options.items()]
     return [word for text in texts for word in text.split(" ", maxsplit=1)]
