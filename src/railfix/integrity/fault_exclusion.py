@@ -1,4 +1,4 @@
-"""Receiver autonomous integrity monitoring (RAIM): exclude faulty satellites and re-solve (P1 2.3(4), P4)."""
+"""Receiver autonomous integrity monitoring (RAIM): exclude faulty satellites and solve again (P1 2.3(4), P4)."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ class RaimResult(NotebookTable):
     """Result of fault detection and exclusion at T epochs."""
 
     outcome: Codes  #: `raim.Outcome`, shape (T,).
-    #: Test statistic before any exclusion, shape (T,); in noise variances, or in m^2 with the fixed limit.
+    #: Test statistic before any exclusion, shape (T,), in noise variances or, in mode "fixed", in m^2.
     statistic: Floats
-    threshold: Floats  #: Threshold of the statistic, NaN where the epoch cannot be tested; shape (T,).
+    threshold: Floats  #: Threshold of the statistic, shape (T,); NaN where the epoch cannot be tested.
     scale: Floats  #: Noise scale used in the test of the residuals, shape (T,).
     excluded: Masks  #: True for excluded channels, shape (T, K).
-    own_error_m: Floats  #: Error of the faulty channels relative to the other channels; NaN elsewhere; shape (T, K).
-    #: Protection level of the remaining ranges (`raim.reliability`), shape (T,); infinite where a fault of one range
-    #: cannot be detected; NaN without a position, with a remaining fault, or with the level or RAIM switched off.
+    own_error_m: Floats  #: Range error of the faulty channels, shape (T, K); NaN for other channels.
+    #: Protection level of the remaining ranges (`raim.reliability`), shape (T,); infinite where a fault of one range is
+    #: undetectable. NaN without a position, with a remaining fault, or if RAIM or this level is switched off.
     protection_level_m: Floats
 
     @property
@@ -52,12 +52,12 @@ class RaimResult(NotebookTable):
 def compute_statistic(
     ranges: Ranges, fix: LineFix, scale: ArrayLike = 1.0, *, limits: RaimLimits | None = None
 ) -> RaimResult:
-    """Return the statistic of the residuals and its threshold (P4) without a test; every outcome is UNTESTABLE."""
+    """Return the statistic of the residuals and its threshold (P4). No test is made: every outcome is UNTESTABLE."""
     return _untested(_detect(fix, ranges.redundancy, scale, limits or RaimLimits()), ranges.weight.shape, scale)
 
 
 def _untested(found: Detection, shape: tuple[int, ...], scale: ArrayLike) -> RaimResult:
-    """Return a result for T epochs and K channels with every outcome UNTESTABLE and no exclusion."""
+    """Return a result without exclusions, in which every outcome is UNTESTABLE."""
     return RaimResult(
         outcome=np.full(shape[0], int(Outcome.UNTESTABLE), dtype=np.int8), statistic=found.statistic,
         threshold=found.threshold, scale=np.broadcast_to(np.asarray(scale, dtype=np.float64), shape[:1]),
@@ -81,14 +81,13 @@ def exclude_faults(
     limits: RaimLimits | None = None,
     fix_limits: FixLimits | None = None,
 ) -> tuple[Ranges, LineFix, RaimResult]:
-    """Exclude up to two faulty satellites per epoch and return the remaining ranges, new positions and test results.
+    """Exclude faulty satellites at each epoch; return the remaining ranges, new positions and test results.
 
     The sum of squared residuals is compared with a chi-square threshold (P4, false-alarm probability 1e-3), or with 100
-    m^2 (P1 table 6, mode "fixed"). Every satellite and then every pair is left out in turn (P1 2.3(4)). A satellite or
-    pair is excluded if the remaining ranges pass the test and the errors of the excluded ranges exceed the limit. A
-    pair is not excluded if the robust fit of the epoch keeps a range of the pair, because other satellites may then be
-    the faulty ones. Where a fault remains unresolved, the position is computed from the ranges kept by the robust fit,
-    and `RaimResult.faulty` is true.
+    m^2 (P1 table 6, mode "fixed"). Every satellite and then every pair is left out in turn (P1 2.3(4), see `exclude`).
+    In chi-square mode, a robust fit confirms the exclusion. A pair is not excluded if the robust fit keeps one of its
+    ranges, because other satellites may then be faulty. Where the fault remains unresolved, `RaimResult.faulty` is
+    True, and the position is computed from the ranges kept by the robust fit.
 
     Parameters
     ----------
@@ -98,12 +97,12 @@ def exclude_faults(
     fix : LineFix
         Positions computed from these ranges (`fix_on_line`).
     scale : array_like, shape (T,) or ()
-        Ratio of the receiver's range standard deviation to the sigmas of the weights (`noise_scale`); a value that is
-        neither positive nor NaN raises ValueError.
+        Ratio of the receiver's range standard deviation to the sigmas of the weights (`noise_scale`). Raise ValueError
+        if it is neither positive nor NaN.
     agreeing : ndarray of bool, shape (T, M), optional
-        Ranges kept by a robust fit on the line (`robust_fit`); computed here by default.
+        Ranges kept by a robust fit on the line (`robust_fit`), by default computed by this function.
     model : LinearModel, optional
-        Linear model of the positions (`linear_model`); computed here by default.
+        Linear model of the positions (`linear_model`), by default computed by this function.
     limits, fix_limits : RaimLimits, FixLimits, optional
     """
     antennas, limits, fix_limits = AntennaRows.on(line), limits or RaimLimits(), fix_limits or FixLimits()
@@ -132,23 +131,24 @@ def exclude_faults(
         return ranges, fix, raim
     ranges = without(ranges, raim.excluded)
     fix = refit_epochs(ranges, antennas, fix, changed, fix_limits)
-    # After an exclusion, another section may fit best; the remaining ranges must also be consistent on the new section.
+    # After an exclusion, another section may fit best. The remaining ranges must also pass the test there.
     still = _detect(fix, ranges.redundancy, scale, limits).detected[changed]
     raim.outcome[changed[still]] = Outcome.UNRESOLVED
     return ranges, fix, raim
 
 
 def _put(raim: RaimResult, epochs: Indices, exclusion: Exclusion, rows: Indices | slice = slice(None)) -> None:
-    """Copy the selected rows of an exclusion, computed for `epochs`, into the result."""
+    """Copy selected rows of an exclusion into the result; `epochs` are the epochs of all its rows."""
     at = epochs[rows]
     for name in ("outcome", "excluded", "own_error_m"):
         getattr(raim, name)[at] = getattr(exclusion, name)[rows]
 
 
 def _by_robust_fit(raim: RaimResult, ranges: Ranges, agreeing: Masks, failing: Indices, min_redundancy: int) -> None:
-    """Exclude the ranges rejected by the robust fit, where the fault is unresolved or the fit keeps an excluded range.
+    """Exclude ranges rejected by the robust fit, where the fault is unresolved or the fit keeps a range of an excluded
+    pair.
 
-    An epoch keeps all its ranges if fewer than `min_redundancy` redundant ranges would remain.
+    No range is excluded where fewer than `min_redundancy` redundant ranges would remain.
     """
     pair = raim.outcome[failing] == Outcome.EXCLUDED_TWO
     contradicted = pair & (raim.excluded[failing] & agreeing[failing]).any(axis=1)
@@ -172,10 +172,10 @@ def _second_attempt(
     limits: RaimLimits,
     fix_limits: FixLimits,
 ) -> Exclusion:
-    """Repeat the exclusion at unresolved epochs at a position without the satellite that has the largest residual.
+    """Repeat the exclusion of unresolved epochs at the position computed without the worst channel.
 
-    On a curve, a large fault moves the position to a part of the line with another direction. A model linearised there
-    is not valid for the true position.
+    On a curve, a large fault moves the position to a part of the line with a different direction. A model that is
+    linearised there is not valid at the true position.
     """
     worst = np.zeros((len(epochs), ranges.code_m.shape[1]), dtype=bool)
     worst[np.arange(len(epochs)), worst_channel(model)] = True

@@ -1,4 +1,4 @@
-"""Detection of satellites with persistent code errors, by the time average of their clipped residuals."""
+"""Detection of satellites with persistent code errors from the time average of their clipped residuals."""
 
 from __future__ import annotations
 
@@ -19,52 +19,52 @@ from railfix.positioning.line_fix import FixLimits, LineFix, refit_epochs
 from railfix.positioning.noise_windows import Windows
 from railfix.positioning.range_arrays import Ranges, without
 
-#: Smallest redundancy number of a range (fraction of its error that appears in its residual) for the test.
+#: Smallest redundancy number (fraction of a range error that appears in its residual) of a tested range.
 _LEAST_REDUNDANCY: Final = 0.1
-#: Mean residuals up to this size are dropped from the state.
+#: Smallest mean residual that is kept in the state.
 _FORGOTTEN: Final = 1e-12
-#: Minimum degrees of freedom after a rejection, so that the remaining ranges can still be tested.
+#: Minimum degrees of freedom after a rejection. The remaining ranges can then still be tested.
 _LEAST_FREEDOM: Final = 2
 
 
 class LastingErrorLimits(Settings):
     """Limits of the test for persistent range errors."""
 
-    #: Time constant of the mean residual. The default is a minute, because reflections end sooner on a moving train.
+    #: Time constant of the mean residual. On a moving train, reflections last less than the default of one minute.
     memory_s: float = Field(default=60.0, gt=0)
-    #: Clipping limit of a residual, in standard deviations of the weights or, if larger, of the receiver's noise.
+    #: Clipping limit of residuals, in standard deviations of the weights or of the receiver noise, whichever is larger.
     clipped: float = Field(default=2.0, gt=0)
-    #: Mean residual, as a fraction of `clipped`, above which a satellite is left out. On fault-free city recordings the
-    #: largest mean is 0.59, except for satellites received by reflection only. An error of 20 m on one satellite
-    #: reaches the limit after 75 to 115 s.
+    #: Mean residual, as a fraction of `clipped`, above which a satellite is rejected. On fault-free city recordings,
+    #: the largest mean is 0.59, except for satellites received by reflection only. If one satellite has an error of 20
+    #: m, its mean exceeds the limit after 75 to 115 s.
     share: float = Field(default=0.62, gt=0, le=1)
-    #: Largest number of satellites left out at an epoch; 0 disables the test.
+    #: Largest number of satellites rejected at an epoch; 0 disables the test.
     most_satellites: int = Field(default=2, ge=0, le=4)
 
 
 @dataclass(frozen=True, kw_only=True)
 class LastingErrorState:
-    """Mean residuals of one antenna after the last epoch."""
+    """Mean residuals of one antenna after a chunk."""
 
     #: Time of the last epoch, NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    age: float = 0.0  #: Age of the means at the last epoch, in units of `memory_s` (`Windows`).
+    age: float = 0.0  #: Age of the means at the last epoch, in windows of `memory_s`.
     channel: Strings = field(default_factory=lambda: np.empty(0, dtype="<U6"))  #: Satellite and signal, shape (S,).
-    #: Sums for the noise scale of all ranges, faulty ranges included (`NoiseState`); shape (2,).
+    #: Sums for the noise scale of all ranges, including faulty ranges (`NoiseState`), shape (2,).
     noise: Floats = field(default_factory=lambda: np.zeros(2))
-    #: Mean residuals as fractions of `clipped`, shape (S, P); column p is computed after the rejection of p satellites.
+    #: Mean residuals as fractions of `clipped`, shape (S, P); column p is the mean after rejecting p satellites.
     sums: Floats = field(default_factory=lambda: np.empty((0, 0)))
 
 
 class BiasLimits(NamedTuple):
-    """Limits of the test for persistent errors, and limits for the positions computed after a rejection."""
+    """Limits of the test for persistent errors, and of positions computed after a rejection."""
 
     lasting: LastingErrorLimits = LastingErrorLimits()
     fix: FixLimits = FixLimits()
 
 
 class PersistentBiases(NamedTuple):
-    """Positions of T epochs, computed without the satellites that have persistent errors."""
+    """Positions of T epochs without the satellites that have persistent errors."""
 
     fix: LineFix
     model: LinearModel  #: Linear model of the positions.
@@ -81,11 +81,11 @@ def reject_persistent_biases(
     states: Sequence[LastingErrorState],
     limits: BiasLimits,
 ) -> tuple[Ranges, PersistentBiases, list[LastingErrorState]]:
-    """Reject satellites with persistent code errors, and return the remaining ranges, positions and new states.
+    """Reject satellites with persistent code errors; return the remaining ranges, new positions and new states.
 
-    An error of twice the noise passes the single-epoch test of P4, so the clipped residuals are averaged over time. The
-    satellite with the largest mean is rejected first. The positions are then computed again, and the next satellite is
-    chosen by the new residuals.
+    An error of twice the noise passes the single-epoch test of P4. The clipped residuals are therefore averaged over
+    time. The satellite with the largest mean is rejected first. Then the positions are computed again, and their
+    residuals determine the next satellite.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def reject_persistent_biases(
     ranges, line, fix
         As for `exclude_faults`.
     noise : ndarray, shape (T,)
-        Noise scale of the receiver; values below 1 count as 1.
+        Noise scale of the receiver at each epoch; values below 1 count as 1.
     states : sequence of LastingErrorState
         State of each antenna after the previous chunk; `LastingErrorState()` at the start.
     limits : BiasLimits
@@ -137,7 +137,7 @@ def reject_persistent_biases(
 
 
 def _find_worst(mean: Floats, used: Masks, share: float) -> Masks:
-    """Return a mask (T, K) of each epoch's used range with the largest absolute mean, if the mean exceeds `share`."""
+    """Return a mask (T, K) of the used range with the largest absolute mean of each epoch, if it exceeds `share`."""
     found = np.zeros_like(used)
     if mean.shape[1]:
         rows, worst = np.arange(len(mean)), np.abs(np.where(used, mean, 0.0)).argmax(axis=1)
@@ -151,7 +151,7 @@ def _is_remembered(state: LastingErrorState) -> Masks:
 
 
 def _own_errors(model: LinearModel, noise: Floats, clipped: float) -> Floats:
-    """Return the normalised residuals, clipped and divided by `clipped`, shape (T, K); 0 with too little redundancy."""
+    """Return normalised residuals, clipped and divided by `clipped`, shape (T, K); 0 for ranges that are not tested."""
     checked = model.redundancy > _LEAST_REDUNDANCY
     own = np.where(checked, model.residual / np.sqrt(np.where(checked, model.redundancy, 1.0)), 0.0)
     own = np.where(np.isnan(own), 0.0, own) / np.maximum(noise, 1.0)[:, None]

@@ -1,4 +1,4 @@
-"""Validation of conventional single-point positions (RTKLIB: `valsol` of pntpos.c)."""
+"""Validation of conventional single-point positions (RTKLIB: `valsol` in pntpos.c)."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from railfix.positioning.range_arrays import Ranges
 
 
 class PointStatus(IntEnum):
-    """Result of the validation of a conventional position."""
+    """Validation result of a conventional single-point position."""
 
-    #: Residuals and dilution of precision passed. Without a redundant range, the residuals are not tested.
+    #: The residuals and the dilution of precision are within their limits. Residuals are not tested without redundancy.
     VALID = 0
     #: No position.
     NO_POSITION = 1
@@ -33,10 +33,10 @@ def _of_residuals(limits: SinglePointLimits) -> RaimLimits:
 
 
 def validate_point(point: SinglePoint, ranges: Ranges, noise_scale: Floats, *, limits: SinglePointLimits) -> Codes:
-    """Return the `PointStatus` of each conventional position, shape (T,); one clock per constellation is estimated.
+    """Return the `PointStatus` of each conventional position, shape (T,).
 
     `noise_scale`, shape (T,), is the ratio of the receiver's range standard deviation to the sigmas of the weights. The
-    checks are the same as in pntpos.c (RTKLIB: `valsol`).
+    checks are those of RTKLIB's `valsol`; one clock per constellation is assumed.
     """
     test = detect(
         point.wsse, point.residual_m, ranges.space_redundancy, scale=noise_scale,
@@ -50,7 +50,7 @@ def validate_point(point: SinglePoint, ranges: Ranges, noise_scale: Floats, *, l
 
 
 def position_dilution(ranges: Ranges, ecef_m: Floats) -> Floats:
-    """Return the position dilution of precision (PDOP) with one clock per constellation, shape (T,).
+    """Return the position dilution of precision (PDOP), shape (T,), with one clock per constellation.
 
     PDOP is the square root of the trace of the position covariance for ranges of unit sigma (RTKLIB: `dops`). It is NaN
     where the geometry is singular.

@@ -1,9 +1,9 @@
 """Stanford diagram along the track: position error against protection level.
 
-Every epoch belongs to one region, which depends on the alarm limit AL, the protection level PL and the absolute error:
+The region of an epoch depends on the alarm limit AL, the protection level PL and the absolute position error:
 
-- no position: both the level and the error are missing;
-- unjudged: the level is known, but the error is unknown, because there is no reference;
+- no position: both PL and error are unknown;
+- unjudged: PL is known, but there is no reference for the error;
 - nominal: error <= PL <= AL;
 - misleading: PL < error <= AL;
 - hazardously misleading: PL <= AL < error;
@@ -23,12 +23,12 @@ from numpy.typing import ArrayLike
 
 from railfix.core.arrays import Codes, Datetimes, Floats, Indices, Integers, Masks
 
-_BINS: Final = 100  #: Number of bins per axis; both axes extend to twice the alarm limit.
-_GAP: Final = 1.5  #: Two epochs are separated by a gap if their interval exceeds this multiple of the median interval.
+_BINS: Final = 100  #: Number of bins per axis. Both axes extend to twice the alarm limit.
+_GAP: Final = 1.5  #: Intervals between epochs longer than this multiple of the median interval are gaps.
 
 
 class Region(IntEnum):
-    """Region of an epoch in the diagram."""
+    """Region of an epoch in the Stanford diagram."""
 
     NO_POSITION = 0
     NOMINAL = 1
@@ -41,11 +41,11 @@ class Region(IntEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Continuity:
-    """Continuity over windows of one length that start at an available epoch."""
+    """Continuity over windows of one length, each of which starts at an available epoch."""
 
     window_s: float  #: Length of the windows.
-    windows: int  #: Number of windows that start at an available epoch and end within the run.
-    kept: int  #: Number of windows without an unavailable epoch and without a gap.
+    windows: int  #: Number of windows that end within the run.
+    kept: int  #: Number of windows without unavailable epochs and gaps.
     probability: float  #: Ratio kept / windows; NaN without windows.
 
 
@@ -56,16 +56,16 @@ class Stanford:
     alarm_limit_m: float
     region: Codes  #: `Region`, shape (T,).
     counts: dict[Region, int]  #: Number of epochs in each region; the counts add up to T.
-    available_rate: float  #: Fraction of the T epochs with a level within the alarm limit; NaN without epochs.
-    beyond: Indices  #: Indices of the epochs whose error exceeds the level, the largest excess first.
+    available_rate: float  #: Fraction of all epochs with PL <= AL; NaN without epochs.
+    beyond: Indices  #: Indices of epochs with error > PL, sorted by descending excess.
     continuity: tuple[Continuity, ...]  #: One entry per window length.
-    #: Number of time blocks that contain epochs. A block counts as one independent sample, because errors are
-    #: correlated over tens of seconds.
+    #: Number of time blocks that contain epochs. Errors are correlated over tens of seconds, so that a block counts as
+    #: one independent sample.
     blocks: int
-    misleading_blocks: int  #: Number of time blocks in which an error exceeds the level.
-    #: Edges of the bins of error and level, shape (N + 1,); the last edge is infinite.
+    misleading_blocks: int  #: Number of time blocks that contain an epoch with error > PL.
+    #: Edges of the error bins and of the protection level bins, shape (N + 1,); the last edge is infinite.
     edges_m: Floats
-    histogram: Integers  #: Number of epochs by bins of the absolute error (axis 0) and the level (axis 1); (N, N).
+    histogram: Integers  #: Number of epochs per error bin (axis 0) and protection level bin (axis 1), shape (N, N).
 
 
 def stanford(
@@ -82,14 +82,14 @@ def stanford(
     Parameters
     ----------
     time : ndarray of datetime64, shape (T,)
-        Ascending times of all epochs of the run, with or without a position.
+        Ascending times of all epochs of the run, including epochs without a position.
     error_m : array_like, shape (T,) [m]
         Error along the track, signed or absolute; NaN without a position or without a reference.
     level_m : array_like, shape (T,) [m]
-        Protection level; infinite where no error can be excluded, NaN without a position. Where the error is known but
-        the level is missing, the level counts as infinite.
+        Protection level; infinite where the error is unbounded, NaN without a position. If the error is known, a
+        protection level of NaN counts as infinite.
     windows_s : sequence of float [s]
-        Lengths of the continuity windows. The default of 15 s is taken from aviation approaches, and 60 s is a travel
+        Lengths of the continuity windows. The default of 15 s is used for aviation approaches; 60 s is a typical travel
         time between two stations.
     block_s : float [s]
         Length of the time blocks, counted from the first epoch.
@@ -145,7 +145,7 @@ def _nanoseconds(value_s: float) -> np.timedelta64:
 
 
 def _continuity(time: Datetimes, available: Masks, window_s: float) -> Continuity:
-    """Return the continuity over windows ``[t, t + window]`` from each available epoch t; a gap interrupts a window."""
+    """Return the continuity over windows ``[t, t + window_s]`` that start at each available epoch t."""
     if len(time) < 2:
         return Continuity(window_s=window_s, windows=0, kept=0, probability=np.nan)
     step = np.diff(time)
@@ -154,7 +154,7 @@ def _continuity(time: Datetimes, available: Masks, window_s: float) -> Continuit
     until = time + _nanoseconds(window_s)
     started = available & (until <= time[-1])
     last = np.searchsorted(time, until, side="right") - 1
-    # A window that ends inside a gap is also interrupted, because the next epoch is after the gap.
+    # A window that ends within a gap is also interrupted.
     ends = np.append(across, False)[last] & (until > time[last])
     kept = started & (broken[last] == broken) & ~ends
     windows = int(started.sum())

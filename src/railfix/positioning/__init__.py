@@ -1,4 +1,4 @@
-"""Positions from corrected pseudoranges: normal equations without clocks, section search, constrained fix."""
+"""Positions from corrected pseudoranges: normal equations, section search, and fix constrained to the line."""
 
 import lazy_loader
 

@@ -1,7 +1,7 @@
-"""Epochs of several antennas as rows of common arrays.
+"""Assignment of array rows to the antennas of a train.
 
-Stages that depend neither on the line nor on earlier epochs process all rows in one call. Other stages are called once
-for the rows of each antenna, and the results are joined.
+The epochs of several antennas are rows of the same arrays. Stages that depend on neither the line nor earlier epochs
+process all rows in one call. Other stages process the rows of each antenna separately.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ State = TypeVar("State")
 
 @dataclass(frozen=True)
 class AntennaRows:
-    """Assignment of rows to antennas."""
+    """Assignment of array rows to antennas."""
 
     indices: tuple[SearchIndex, ...]  #: Search index of each antenna's trajectory; all maps have the same sigmas.
     parts: tuple[slice, ...]  #: Rows of each antenna, in the order of `indices`; `EVERY` for a single antenna.
 
     @classmethod
     def on(cls, line: Trajectory | SearchIndex | AntennaRows) -> AntennaRows:
-        """Return `line` if it is an `AntennaRows`, otherwise the assignment of all rows to one antenna on this line."""
+        """Return `line` if it is an `AntennaRows`, else an assignment of all rows to one antenna on `line`."""
         if isinstance(line, AntennaRows):
             return line
         return cls((line if isinstance(line, SearchIndex) else SearchIndex(line),), (EVERY,))
 
     @property
     def sigma_plan_m(self) -> float:
-        """Standard deviation of the map across the line [m]."""
+        """Lateral standard deviation of the map [m]."""
         return self.indices[0].trajectory.sigma_plan_m
 
     @property
     def sigma_height_m(self) -> float:
-        """Standard deviation of the heights of the map [m]."""
+        """Standard deviation of the map heights [m]."""
         return self.indices[0].trajectory.sigma_height_m
 
     @property
@@ -49,22 +49,22 @@ class AntennaRows:
         return [(index.trajectory, rows) for index, rows in zip(self.indices, self.parts, strict=True)]
 
     def apart(self, function: Callable[..., Value], *of_antennas: Sequence[Any]) -> list[Value]:
-        """Call a function once per antenna with its search index, rows, and item of each list; return the results."""
+        """Return a function's results for each antenna: its arguments are search index, rows and item of each list."""
         return [function(*each) for each in zip(self.indices, self.parts, *of_antennas, strict=True)]
 
     def each(self, function: Callable[..., Value], *of_antennas: Sequence[Any]) -> Value:
-        """Call a function for each antenna as `apart` does, and return the results joined along the rows."""
+        """Call a function for each antenna (see `apart`) and return the results joined along the rows."""
         return join_epochs(self.apart(function, *of_antennas))
 
     def each_with_state(
         self, function: Callable[..., tuple[Value, State]], *of_antennas: Sequence[Any]
     ) -> tuple[Value, list[State]]:
-        """Call a function that returns a value and a state, once per antenna; return the joined values, and states."""
+        """Call a function that returns a value and a state for each antenna; join the values."""
         found = self.apart(function, *of_antennas)
         return join_epochs([rows for rows, _ in found]), [state for _, state in found]
 
     def split(self, rows: Indices) -> Iterator[tuple[SearchIndex, Indices]]:
-        """Yield the search index and the part of `rows` (ascending) of each antenna; skip antennas without a row."""
+        """Yield the search index of each antenna and its part of `rows` (ascending); skip antennas without rows."""
         if len(self.parts) == 1:
             if len(rows):
                 yield self.indices[0], rows
@@ -75,7 +75,7 @@ class AntennaRows:
                 yield index, own
 
     def at_arc(self, arc_m: Floats) -> Floats:
-        """Return the positions on the lines at arc lengths, ECEF, shape (T, 3) [m]; NaN where the arc length is NaN."""
+        """Return the ECEF positions on the lines at arc lengths, shape (T, 3) [m]; NaN where the arc length is NaN."""
         return self.each(lambda index, rows: index.trajectory.at_arc(arc_m[rows]))
 
     def chainage_at(self, arc_m: Floats) -> Floats:
@@ -91,5 +91,5 @@ class AntennaRows:
         return self.each(lambda index, rows: index.trajectory.get_axes(section[rows]))
 
 
-#: Line of a stage: the trajectory of one antenna, its search index, or the rows of several antennas.
+#: Line argument of a stage: one antenna's trajectory or its search index, or the lines of several antennas.
 Line = Trajectory | SearchIndex | AntennaRows

@@ -1,4 +1,4 @@
-"""Approximate antenna positions from raw ranges, for the computation of satellite directions and delays."""
+"""Approximate antenna positions from raw ranges, for computing satellite directions and delays."""
 
 from __future__ import annotations
 
@@ -14,37 +14,37 @@ from railfix.positioning.normal_equations import SinglePointLimits, point_positi
 from railfix.positioning.range_arrays import Ranges, without
 from railfix.positioning.section_search import SectionLimits, find_section
 
-#: Standard deviation of raw ranges for the approximate position of the antenna [m].
+#: Standard deviation assumed for raw ranges [m].
 ANCHOR_SIGMA_M: Final = 10.0
-#: The iteration ends at a step shorter than this [m]; the error of a range is then at most 0.03 m.
+#: Step length at which the iteration ends [m]. Linearised ranges then have errors of at most 0.03 m.
 _TOLERANCE_M: Final = 1000.0
-#: Largest distance of a raw 3-D position from the line at which it is moved to the line [m].
+#: Raw 3-D positions up to this distance from the line are moved to the line [m].
 MAX_FROM_LINE_M: Final = 1e5
 
 
 class ApproximatePosition(NamedTuple):
-    """Antenna positions accurate to a few hundred metres, and gross errors of raw codes, T epochs by K channels."""
+    """Antenna positions accurate to a few hundred metres, and gross code errors, T epochs by K channels."""
 
     ecef_m: Floats  #: Shape (T, 3).
     arc_m: Floats  #: Arc length of the nearest point of the line, shape (T,).
-    gross: Masks  #: Codes that are grossly wrong, shape (T, K).
-    unsure: Masks  #: Epochs with a grossly wrong code that cannot be identified; shape (T,).
+    gross: Masks  #: True for codes with gross errors, shape (T, K).
+    unsure: Masks  #: True for epochs with gross errors that cannot be identified, shape (T,).
 
 
 def approximate_position(
     ranges: Ranges, line: Line, *, limits: SinglePointLimits | None = None, section: SectionLimits | None = None
 ) -> ApproximatePosition:
-    """Estimate the positions at which delays are computed, from raw codes without gross errors (P1 2.2(2)).
+    """Estimate approximate positions from raw codes, after rejecting gross errors (P1 2.2(2)).
 
-    A 3-D position is estimated from raw ranges of equal weight. The iteration of every epoch starts from the middle of
-    the line, so that epochs are independent. The position is moved to the nearest trajectory point unless it is far
-    from the line. Without a 3-D position, or with a gross error that cannot be identified, the position is the
-    best-fitting point of the line or, if no point fits, the middle of the line.
+    The positions are used to compute atmospheric delays. The iteration of every epoch starts from the middle of the
+    line, so that epochs are independent. Unless far from the line, the 3-D position is moved to the nearest trajectory
+    point. Without a 3-D position, or with a gross error that cannot be identified, the best-fitting point of the line
+    is returned. If no point fits, this is the middle of the line.
 
     Parameters
     ----------
     ranges : Ranges
-        Codes with satellite clock and group delay applied, of equal weight (`weighted_ranges`).
+        Equally weighted codes, corrected for satellite clock and group delay (`weighted_ranges`).
     line : Trajectory, SearchIndex or AntennaRows
         Trajectory of the antenna.
     limits, section : SinglePointLimits, SectionLimits, optional

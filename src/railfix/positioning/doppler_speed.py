@@ -1,14 +1,14 @@
 r"""Speed along the track from carrier Dopplers.
 
 The range ``rho = |s - r| + omega / c (s_x r_y - s_y r_x)``, with the satellite s at ``t - rho / c``, has the derivative
-``rho' = (A + g . v) / (1 + A / c)``, where A is due to the satellite's velocity and ``g = d rho / d r``. A receiver at
-speed v along the unit tangent e of its path measures
+``rho' = (A + g . v) / (1 + A / c)``. A is the part caused by the satellite velocity, and ``g = d rho / d r``. A
+receiver that moves at speed v along the unit tangent e of the track measures
 
     ``-lambda D = (A + (g . e) v) / (1 + A / c) + d_r - d_s + T'``
 
 where d_r and d_s are the drifts of the receiver and satellite clocks [m/s], and T' is the rate of the tropospheric
-delay. The unknowns are v and d_r, for any number of constellations. The rate of the ionospheric delay (millimetres per
-second) is neglected.
+delay. The unknowns are v and d_r, for any number of constellations. The ionospheric delay rate (millimetres per second)
+is neglected.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from railfix.ranges.channels import PLAUSIBLE_CODE_M, channel_order, first_avail
 
 _STEP_S: Final = 1.0  #: Time step of the numerical derivatives of satellite clocks and tropospheric delays [s].
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.
-_PASSES: Final = 3  #: Number of rounds of outlier rejection; each uses the noise scale of the previous fit.
-_TELLING: Final = 2.0  #: Mean squares of residuals up to this many standard deviations above 1 count as noise.
+_PASSES: Final = 3  #: Number of passes of outlier rejection. Each pass uses the noise scale of the previous fit.
+_TELLING: Final = 2.0  #: Normalised variances up to this many standard deviations above 1 count as 1.
 _FLOOR_MPS: Final = 0.02  #: Noise of a Doppler at high C/N0.
 
 
@@ -41,29 +41,29 @@ class DopplerSpeedLimits(Settings):
     """Limits and weights of the Doppler speed."""
 
     mask_deg: float = 10.0  #: Elevation mask.
-    #: Noise of a Doppler at 45 dB-Hz: ``sigma^2 = floor^2 + (zenith 10^((45 - min(C/N0, 50)) / 20))^2``. Only ratios
-    #: between Dopplers affect the speed, because the receiver's noise scale is estimated from the residuals of the log.
+    #: Noise of a Doppler at 45 dB-Hz: ``sigma^2 = floor^2 + (zenith 10^((45 - min(C/N0, 50)) / 20))^2``. Only the
+    #: relative noise of Dopplers affects the speed, because the noise scale is estimated from the residuals of the log.
     zenith_mps: float = Field(default=0.03, gt=0)
-    #: Largest normalised residual of a Doppler that is not rejected (w-test of Baarda, 1968). The largest residual is
-    #: rejected first.
+    #: Largest normalised residual of a Doppler that is not rejected (w-test of Baarda, 1968). Of several, the Doppler
+    #: with the largest residual is rejected first.
     outlier: float = Field(default=3.5, gt=0)
     most_rejected: int = Field(default=8, ge=0)  #: Largest number of Dopplers rejected per epoch.
-    min_satellites: int = Field(default=4, ge=3)  #: Fewest Dopplers per epoch for a fit with 2 unknowns.
+    min_satellites: int = Field(default=4, ge=3)  #: Minimum number of Dopplers per epoch.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Dopplers(FrozenArrays):
-    """Dopplers of one receiver with their satellites, T epochs by K channels."""
+    """Dopplers of one receiver and satellite states, T epochs by K channels."""
 
     time: Datetimes  #: Receiver time of each epoch, shape (T,).
-    #: Satellite of each channel, shape (K,). Of several channels of one satellite, only one per epoch has values.
+    #: Satellite of each channel, shape (K,). At each epoch, only one channel of a satellite has values.
     satellite: Strings
-    rate_mps: Floats  #: ``-lambda D``: positive when the satellite recedes; NaN where absent; shape (T, K).
+    rate_mps: Floats  #: Range rate ``-lambda D``, positive for a receding satellite, shape (T, K); NaN if missing.
     cn0_dbhz: Floats  #: Shape (T, K).
     sat_ecef_m: Floats  #: Satellite position at the time of transmission, shape (T, K, 3).
     earlier_ecef_m: Floats  #: Satellite position one second earlier, shape (T, K, 3).
     sat_velocity_mps: Floats  #: Satellite velocity at the time of transmission, ECEF, shape (T, K, 3).
-    clock_rate_mps: Floats  #: c times the drift of the satellite clock, relativity included; shape (T, K).
+    clock_rate_mps: Floats  #: c times the satellite clock drift, including relativity, shape (T, K).
 
     def __len__(self) -> int:
         return len(self.time)
@@ -73,24 +73,24 @@ class Dopplers(FrozenArrays):
 class DopplerSpeed:
     """Speed along the track, T epochs."""
 
-    #: Speed, positive along the tangent; NaN with too few satellites or singular geometry; shape (T,).
+    #: Speed, positive along the tangent, shape (T,); NaN with too few satellites or singular geometry.
     speed_mps: Floats
     sigma_mps: Floats  #: Standard deviation of `speed_mps`, shape (T,).
-    clock_drift_mps: Floats  #: c times the drift of the receiver clock, shape (T,).
-    residual_mps: Floats  #: Measured minus fitted value of used and rejected Dopplers; NaN elsewhere; shape (T, K).
+    clock_drift_mps: Floats  #: c times the receiver clock drift, shape (T,).
+    residual_mps: Floats  #: Measured minus fitted range rate, shape (T, K); NaN for unused channels.
     used: Masks  #: Dopplers used in the fit, shape (T, K).
     rejected: Masks  #: Dopplers rejected as outliers, shape (T, K).
     n_used: Integers  #: Number of Dopplers used, shape (T,).
-    scale: float  #: Doppler noise of the receiver, from the whole log, divided by the noise assumed in the limits.
+    scale: float  #: Ratio of the receiver's Doppler noise in the whole log to the noise assumed in the limits.
 
 
 def dopplers_of_log(
     obs: Observations, navigation: Navigation, *, systems: Sequence[str], signals: Mapping[str, Sequence[str]]
 ) -> Dopplers:
-    """Return the Dopplers of a log with their satellite positions; one signal per satellite and epoch.
+    """Return the Dopplers of a log and the satellite states, with one signal per satellite and epoch.
 
-    Unhealthy satellites, satellites without navigation records, and channels without a known carrier frequency or
-    without a plausible code are left out. The time of transmission is computed from the code.
+    Excluded are unhealthy satellites, satellites without navigation records, and channels with an unknown carrier
+    frequency or an implausible code. The transmission time is computed from the code.
     """
     columns = channel_order(obs.satellite, obs.signal, systems=systems, signals=signals)
     satellite, signal = obs.satellite[columns], obs.signal[columns]
@@ -118,12 +118,12 @@ def dopplers_of_log(
 def doppler_speed(
     dopplers: Dopplers, ecef_m: Floats, tangent: Floats, *, limits: DopplerSpeedLimits | None = None
 ) -> DopplerSpeed:
-    """Estimate speed along the track and clock drift by weighted least squares, for all epochs at once.
+    """Estimate speed along the track and receiver clock drift at all epochs by weighted least squares.
 
-    Outliers are removed one by one, the largest first, while enough satellites remain. The noise scale is estimated
-    from the median of the normalised residuals of the whole log. `ecef_m`, shape (T, 3), are antenna positions; no
-    speed is computed where they are NaN. A position error of 10 m changes a range rate by 2 mm/s. `tangent`, shape (T,
-    3), are unit vectors along the track.
+    `ecef_m`, shape (T, 3), are antenna positions. Where they are NaN, no speed is computed. A position error of 10 m
+    changes a range rate by 2 mm/s. `tangent`, shape (T, 3), are unit vectors along the track. Outliers are rejected one
+    by one, the largest first, while enough satellites remain. The noise scale is estimated from the median of the
+    normalised residuals of the whole log.
     """
     limits = limits or DopplerSpeedLimits()
     shape = (len(dopplers), 3)
@@ -161,7 +161,7 @@ def doppler_speed(
 
 
 def _equations(dopplers: Dopplers, ecef_m: Floats, tangent: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return measured range rates ``slope v + drift`` [m/s], their slopes, and elevations [deg], shapes (T, K)."""
+    """Return range rates, modelled as ``slope v + drift`` [m/s], slopes, and elevations [deg], shape (T, K)."""
     receiver, along = ecef_m[:, None, :], tangent[:, None, :]
     sat, velocity = dopplers.sat_ecef_m, dopplers.sat_velocity_mps
     _, sight = range_with_rotation(sat, receiver)
@@ -182,7 +182,7 @@ def _equations(dopplers: Dopplers, ecef_m: Floats, tangent: Floats) -> tuple[Flo
 
 @dataclass(frozen=True, kw_only=True)
 class _SpeedFit:
-    """Speed, drift and unscaled variance of the speed, residuals, normalised residuals, and weighted sum of squares."""
+    """Speed, drift, speed variance, residuals, normalised residuals and weighted sum of squares of a fit."""
 
     speed: Floats
     drift: Floats
@@ -198,7 +198,7 @@ def _fit(measured: Floats, slope: Floats, sigma: Floats, used: Masks) -> _SpeedF
         channel_sums(values)
         for values in (weight, weight * slope, weight * slope**2, weight * measured, weight * slope * measured)
     )
-    # Neither several satellites in one direction nor a single satellite determines the speed.
+    # One satellite, or several in the same direction, do not determine the speed.
     determinant = one * hh - h * h
     determinant = np.where((used.sum(axis=1) >= 2) & (determinant > 1e-9 * one * hh), determinant, np.nan)
     speed, drift = (one * hy - h * y) / determinant, (hh * y - h * hy) / determinant
@@ -220,7 +220,7 @@ def _fit(measured: Floats, slope: Floats, sigma: Floats, used: Masks) -> _SpeedF
 def _reject_outliers(
     measured: Floats, slope: Floats, sigma: Floats, offered: Masks, scale: float, limits: DopplerSpeedLimits
 ) -> tuple[Masks, _SpeedFit]:
-    """Reject the largest outlier of each epoch repeatedly; return the remaining Dopplers, and their fit."""
+    """Repeatedly reject the largest outlier of each epoch; return a mask of the remaining Dopplers, and their fit."""
     used = offered.copy()
     fit = _fit(measured, slope, sigma, used)
     for _ in range(limits.most_rejected):

@@ -1,9 +1,9 @@
-"""Detect grossly wrong codes before a least-squares fit to all codes.
+"""Detection of gross code errors before a least-squares fit to all codes.
 
 A least-squares position absorbs part of every error. A code error of 10 km moves the position by kilometres, to a point
-at which neither the atmospheric models nor the map are valid. At this point, other satellites may have the largest
-residuals. The position with the least sum of absolute residuals does not move further when an error grows, because the
-influence of an outlying range does not depend on the size of its error.
+where neither the atmospheric models nor the map are valid and where correct codes may have the largest residuals. The
+position with the least sum of absolute residuals is robust: the influence of an outlying range does not depend on the
+size of its error.
 """
 
 from __future__ import annotations
@@ -23,31 +23,31 @@ from railfix.positioning.normal_equations import SinglePoint, normal_equations
 from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases, Ranges
 from railfix.track.trajectory import Trajectory
 
-#: Errors of raw codes (without atmospheric corrections) above this are gross errors [m].
+#: Raw code errors (without atmospheric corrections) above this limit are gross errors [m].
 GROSS_M: Final = 100.0
-#: Codes agree with each other if the median of their absolute residuals is below this [m].
+#: Codes agree if the median of their absolute residuals is below this limit [m].
 AGREEING_M: Final = 30.0
-#: Least number of redundant ranges that must remain after an exclusion at a 3-D position, to test the result.
+#: Minimum number of redundant ranges after an exclusion at a 3-D position, so that the result can be tested.
 _LEFT_IN_SPACE: Final = 3
-#: With fewer redundant ranges, the fit after every other exclusion must be worse by this factor.
+#: With fewer redundant ranges, the residuals after every other exclusion must be larger by this factor.
 _CLEARER: Final = 5.0
-#: A corrected code is inconsistent with the other codes if its residual exceeds this multiple of the robust scale.
+#: Corrected codes with residuals above this multiple of the robust scale disagree with the other codes.
 _DISAGREE: Final = 5.0
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.
-#: Largest number of iterations. Residuals that divide weights are at least `_COARSE` sigmas in the first
-#: `_COARSE_STEPS` iterations, and at least `_FINE` sigmas afterwards.
+#: Largest number of iterations. In reweighting, residuals count as at least `_COARSE` sigmas in the first
+#: `_COARSE_STEPS` iterations, and as at least `_FINE` sigmas afterwards.
 _STEPS: Final = 60
 _COARSE_STEPS: Final = 10
 _COARSE, _FINE = 1.0, 0.3
 _LONGEST_STEP_M: Final = 3e6
 _SETTLED_M: Final = 0.3
-_SINGULAR: Final = 1e-15  #: A normal matrix of unit trace with a determinant up to this is singular.
+_SINGULAR: Final = 1e-15  #: A normal matrix, scaled to unit trace, is singular up to this determinant.
 
 
 def least_absolute(ranges: Ranges, start_ecef_m: Floats) -> Floats:
-    """Estimate the positions with the least sum of absolute weighted residuals, clocks eliminated, shape (T, 3) [m].
+    """Estimate the positions with the least sum of absolute normalised residuals, shape (T, 3) [m].
 
-    The method is iteratively reweighted least squares from `start_ecef_m`, shape (T, 3), accurate to a few thousand
+    The method is iteratively reweighted least squares. `start_ecef_m`, shape (T, 3), may have errors of a few thousand
     kilometres. The position is NaN where the ranges do not determine it.
     """
     place, factor = start_ecef_m.copy(), np.ones(ranges.weight.shape)
@@ -69,7 +69,7 @@ def least_absolute(ranges: Ranges, start_ecef_m: Floats) -> Floats:
 
 
 def residuals_at(ranges: Ranges, place_ecef_m: Floats) -> Floats:
-    """Return residuals at positions (T, 3), minus the median residual of each clock, (T, M) [m]; NaN where not used."""
+    """Return residuals at positions (T, 3) after subtracting each clock's median, shape (T, M) [m]; NaN if unused."""
     even = replace(ranges, weight=kernel_array((ranges.weight > 0).astype(np.float64)), ties=None)
     residual = normal_equations(even, np.nan_to_num(place_ecef_m)).residual_m
     value = np.where(ranges.weight > 0, residual, np.nan)
@@ -79,11 +79,10 @@ def residuals_at(ranges: Ranges, place_ecef_m: Floats) -> Floats:
 
 
 def gross_in_space(ranges: Ranges, start_ecef_m: Floats) -> Masks:
-    """Find the raw codes with errors above `GROSS_M`, shape (T, M), where the other codes agree on a 3-D position.
+    """Find raw codes with gross errors, shape (T, M), where the other codes agree on a 3-D position.
 
     At least `_LEFT_IN_SPACE` redundant ranges must remain and agree. With fewer redundant ranges, a single range is
-    rejected if the other ranges agree without it, and if the exclusion of any other single range does not lead to
-    agreement.
+    rejected if all others agree without it, and if no other single exclusion leads to agreement.
     """
     place = least_absolute(ranges, start_ecef_m)
     residual = residuals_at(ranges, place)
@@ -100,7 +99,7 @@ def gross_in_space(ranges: Ranges, start_ecef_m: Floats) -> Masks:
 
 
 def _one_of_few(ranges: Ranges, start_ecef_m: Floats) -> Masks:
-    """Return a mask (T, M) of the range without which all others agree within `AGREEING_M`; empty if ambiguous."""
+    """Return a mask (T, M) of the only range without which all others agree within `AGREEING_M`."""
     epochs, channels = ranges.weight.shape
     epoch, channel = np.nonzero(ranges.weight > 0)
     each = ranges.take(epoch)
@@ -127,7 +126,7 @@ def _one_of_few(ranges: Ranges, start_ecef_m: Floats) -> Masks:
 
 
 def _step(matrix: Floats, vector: Floats) -> Floats:
-    """Return the steps of normal equations, at most `_LONGEST_STEP_M` long, shape (T, 3) [m]; NaN if singular."""
+    """Return steps of the normal equations, at most `_LONGEST_STEP_M` long, shape (T, 3) [m]; NaN if singular."""
     trace = np.trace(matrix, axis1=1, axis2=2)[:, None, None]
     singular = ~(np.linalg.det(matrix / np.maximum(trace, 1e-300)) > _SINGULAR)
     solvable = np.where(singular[:, None, None], np.eye(3), matrix)
@@ -138,10 +137,10 @@ def _step(matrix: Floats, vector: Floats) -> Floats:
 
 
 def disagreeing(ranges: Ranges, start_ecef_m: Floats) -> Masks:
-    """Find the corrected ranges that are inconsistent with the majority of an epoch, shape (T, M).
+    """Find corrected ranges that disagree with the other ranges of an epoch, shape (T, M).
 
-    The residuals of these ranges at the position of least absolute residuals exceed `_DISAGREE` robust scales, where
-    the scale is at least one sigma. No range is marked where fewer than `_LEFT_IN_SPACE` redundant ranges would remain.
+    At the position of least absolute residuals, the residuals of these ranges exceed `_DISAGREE` robust scales. The
+    scale is at least one sigma. No range is marked where fewer than `_LEFT_IN_SPACE` redundant ranges would remain.
     """
     place = least_absolute(ranges, start_ecef_m)
     white = np.abs(residuals_at(ranges, place)) * np.sqrt(ranges.weight)
@@ -154,35 +153,35 @@ def disagreeing(ranges: Ranges, start_ecef_m: Floats) -> Masks:
 
 
 _COARSE_M: Final = 100.0  #: Spacing of line points in the coarse scan [m].
-_FINE_M: Final = 12.5  #: Spacing in the fine scan around the best point of the coarse scan [m].
-#: Usual limit of the differences between the clocks of constellations [m]: up to 71 m in the recordings.
+_FINE_M: Final = 12.5  #: Spacing of line points in the fine scan [m].
+#: Largest usual difference between clocks of constellations [m]; up to 71 m in recordings.
 _CLOCKS_APART_M: Final = 200.0
-#: Clocks with one or two ranges that differ from the other clocks by more than this are not used [m].
+#: A clock with one or two ranges is not used if it differs from the other clocks by more than this limit [m].
 _CLOCK_AWAY_M: Final = 600.0
-#: Largest product of points, epochs and channels that are computed together.
+#: Largest product of points, epochs and channels of a block.
 _BLOCK: Final = 2_000_000
-#: The cost of every other exclusion must be larger by this fraction of `GROSS_M`.
+#: Smallest cost difference between exclusions that is clear, as a fraction of `GROSS_M`.
 _CLEAR: Final = 0.7
-#: Least number of redundant ranges that must agree with a point of the line.
+#: Minimum number of redundant ranges that agree with a point of the line.
 _LEFT_ON_LINE: Final = 2
 
 
 class LineScan(NamedTuple):
-    """Best points of a line for raw ranges of T epochs by M channels."""
+    """Best-fitting points of a line for raw ranges of T epochs by M channels."""
 
-    arc_m: Floats  #: Point with the least cost, shape (T,).
-    gross: Masks  #: Ranges whose residuals at the point exceed `GROSS_M`, shape (T, M).
-    #: Redundancy of the ranges without gross errors; 0 where these ranges do not agree with the point; shape (T,).
+    arc_m: Floats  #: Arc length of the best-fitting point, shape (T,).
+    gross: Masks  #: True for ranges with a residual above `GROSS_M` at the point, shape (T, M).
+    #: Redundancy of the other ranges, shape (T,); 0 where they do not agree with the point.
     agreeing: Integers
-    clear: Masks  #: Epochs at which all points that imply other gross errors have a clearly larger cost, shape (T,).
+    clear: Masks  #: True where all points with other gross errors have a clearly larger cost, shape (T,).
 
 
 def scan_line(ranges: Ranges, line: Trajectory) -> LineScan:
-    """Find the point of a line that agrees best with the raw ranges of each epoch, by a robust cost.
+    """Find the point of a line with the least robust cost of each epoch's raw ranges.
 
-    The median residual of each clock is subtracted from the residuals. The cost of a point is the sum of the absolute
-    residuals, each limited to `GROSS_M`, so that larger errors do not increase the cost. Points `_COARSE_M` apart are
-    evaluated first, then points around the best of these points.
+    Each clock's median residual is subtracted. The cost of a point is the sum of the absolute residuals, each limited
+    to `GROSS_M`, so that larger errors do not increase the cost. After a coarse scan of the whole line, the
+    surroundings of the best point are scanned finely.
     """
     epochs = len(ranges)
     nodes = np.linspace(line.arc_m[0], line.arc_m[-1], max(int(np.ceil(np.ptp(line.arc_m) / _COARSE_M)), 1) + 1)
@@ -210,12 +209,13 @@ def scan_line(ranges: Ranges, line: Trajectory) -> LineScan:
 
 
 def _line_residuals(ranges: Ranges, place_ecef_m: Floats) -> Floats:
-    """Return residuals at positions (T, N, 3), minus the median residual of each clock, (T, N, M) [m]; NaN if unused.
+    """Return residuals at positions (T, N, 3) after subtracting each clock's median, shape (T, N, M) [m]; NaN if
+    unused.
 
-    The median of an even number is the mean of the lower and the upper median, unless one of these has a clearly
-    smaller `_capped_cost`. The mean fits no range if half of the ranges have gross errors. If some residuals of a clock
-    agree with the median of all residuals to `_CLOCKS_APART_M`, the median of this clock is the median of these
-    residuals alone.
+    If residuals of a clock agree with the median of all clocks within `_CLOCKS_APART_M`, only these residuals determine
+    the median of the clock. For an even number, the median is the mean of the lower and the upper median, or the lower
+    or upper median if its `_capped_cost` is clearly smaller. This is necessary because the mean fits no range if half
+    of the ranges have gross errors.
     """
     used, satellite = ranges.weight > 0, ranges.sat_ecef_m
     square = -2.0 * (place_ecef_m @ satellite.swapaxes(1, 2))
@@ -247,30 +247,30 @@ def _capped_cost(residual_m: Floats) -> Floats:
 class GrossErrors(NamedTuple):
     """Gross errors of raw ranges, T epochs by M channels."""
 
-    gross: Masks  #: Ranges with gross errors, shape (T, M).
-    #: Arc length of the best-fitting point of the line, at epochs whose gross errors cannot be identified or whose 3-D
-    #: position is missing or implausible; NaN at other epochs; shape (T,).
+    gross: Masks  #: True for ranges with gross errors, shape (T, M).
+    #: Arc length of the best-fitting point of the line, shape (T,), for epochs with unidentified gross errors or
+    #: without a plausible 3-D position; NaN at other epochs.
     unsure_arc_m: Floats
-    unsure: Masks  #: Epochs with a grossly wrong range that cannot be identified, shape (T,).
+    unsure: Masks  #: True for epochs with gross errors that cannot be identified, shape (T,).
 
 
-#: Plausible ellipsoidal heights of trains, with a margin [m]. Positions at other heights are not used.
+#: Smallest and largest plausible ellipsoidal height of trains, with a margin [m].
 _HEIGHTS_M: Final = (-500.0, 10_000.0)
-#: An epoch is examined if the root of the sum of the squared raw residuals is not below this [m].
+#: Epochs with a smaller root of the sum of squared raw residuals are not examined [m].
 _QUIET_M: Final = 30.0
-#: An epoch is also examined if the 3-D position is farther from the line than this [m].
+#: Epochs with a 3-D position farther from the line are also examined [m].
 _BESIDE_M: Final = 1000.0
 
 
 def gross_errors(ranges: Ranges, antennas: AntennaRows, point: SinglePoint) -> GrossErrors:
-    """Find gross errors of raw ranges, given their least-squares 3-D positions `point`.
+    """Find gross errors of raw ranges; `point` are the least-squares 3-D positions of all ranges.
 
     Epochs with large residuals, or with positions far from the line, are examined. Gross errors are identified at the
-    best point of the line (`scan_line`), if redundant ranges agree with it and the cost of every other exclusion is
-    clearly larger. Where the ranges agree with no point of the line, gross errors are identified at a 3-D position
-    (`gross_in_space`). Where neither method identifies gross errors, the epoch is unsure. At an unsure epoch, the
-    ranges with gross errors at the best point are still returned, so that they do not move the position. This requires
-    that they are at most half of the ranges, and that redundant ranges agree with the point.
+    best point of the line (`scan_line`) if redundant ranges agree with it and every other exclusion has a clearly
+    larger cost. Where the ranges agree with no point of the line, gross errors are identified at a 3-D position
+    (`gross_in_space`). If neither method succeeds, the epoch is unsure. At an unsure epoch, the ranges with gross
+    errors at the best point are also marked, if they are at most half of the ranges and redundant ranges agree with the
+    point.
     """
     gross, arc = np.zeros(ranges.weight.shape, dtype=np.bool_), np.full(len(ranges), np.nan)
     unsure = np.zeros(len(ranges), dtype=np.bool_)
@@ -280,7 +280,7 @@ def gross_errors(ranges: Ranges, antennas: AntennaRows, point: SinglePoint) -> G
     suspect = loud.copy()
     for index, rows in antennas.split(np.flatnonzero(located)):
         suspect[rows] |= np.asarray(index.tree.query(point.ecef_m[rows])[0]) > _BESIDE_M
-    # ranges that agree in space have no gross error, even if the map is wrong
+    # ranges that agree with a 3-D position have no gross error, even if the map is wrong
     largest = np.abs(residual).max(axis=1, initial=0.0)
     agree = located & (ranges.space_redundancy >= _LEFT_IN_SPACE) & (largest < 0.5 * GROSS_M)
     suspect &= ~agree & (ranges.redundancy > 0)
@@ -306,12 +306,13 @@ def gross_errors(ranges: Ranges, antennas: AntennaRows, point: SinglePoint) -> G
 def gross_alone(
     weight: Floats, groups: Sequence[slice], clock_m: Floats, ties: InterSystemBiases | None = None
 ) -> Masks:
-    """Find the ranges of clocks with few ranges where these clocks contradict the other clocks, shape (T, M).
+    """Find ranges of clocks that have few ranges and contradict the other clocks, shape (T, M).
 
-    While a clock is estimated freely, no other range tests the sole range of this clock. With `ties`, the known biases
-    test the sole range to `GROSS_M`. Without `ties`, the one or two ranges of a clock are marked if the clock differs
-    from the common clock by more than `_CLOCK_AWAY_M`. `clock_m`, shape (T, G), are clocks estimated without ties. The
-    common clock is the median of the clocks minus their biases, weighted by the number of satellites.
+    If a clock is estimated separately, no other range tests its only range. Clocks are therefore compared with the
+    common clock, which is the median of all clocks minus their biases, weighted by the number of satellites. With
+    `ties`, the only range of a clock is marked if the clock differs by more than `GROSS_M`. Without `ties`, the one or
+    two ranges of a clock are marked if it differs by more than `_CLOCK_AWAY_M`. `clock_m`, shape (T, G), are clocks
+    estimated without ties.
     """
     found = np.zeros(weight.shape, dtype=np.bool_)
     count = np.add.reduceat((weight > 0).astype(np.int64), [group.start for group in groups], axis=1)

@@ -1,7 +1,7 @@
 """Robust fits of an epoch's ranges.
 
-Fits are iteratively reweighted least squares with the IGG-III weights (Yang, Song and Xu, Journal of Geodesy 76, 2002)
-and the median of the absolute residuals as scale, so that no noise level has to be assumed.
+The fits are iteratively reweighted least squares with IGG-III weights (Yang, Song and Xu, Journal of Geodesy 76, 2002).
+The scale is the median of the absolute residuals, so that no noise level is assumed.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class RobustFitLimits(Settings):
 
     keep: float = Field(default=1.5, gt=0)  #: Residuals up to this multiple of the scale have full weight.
     reject: float = Field(default=4.0, gt=0)  #: Residuals above this multiple of the scale have zero weight.
-    #: Number of reweightings. On the demonstration with a 20 m error of one satellite, the fifth reweighting changes no
+    #: Number of reweightings. For the demonstration with an error of 20 m on one satellite, the fifth changes no
     #: decision.
     iterations: int = Field(default=5, ge=1)
 
@@ -37,19 +37,19 @@ class RobustFitLimits(Settings):
 class RobustFit:
     """Ranges that agree with each other, T epochs by M channels."""
 
-    kept: Masks  #: Used ranges whose residual is below `RobustFitLimits.reject` scales, shape (T, M).
-    #: Weighted sum of squared residuals of the kept ranges over `freedom`; NaN where `freedom` is 0; shape (T,).
+    kept: Masks  #: True for used ranges with a residual below `RobustFitLimits.reject` scales, shape (T, M).
+    #: Weighted sum of squared residuals of the kept ranges, divided by `freedom`, shape (T,); NaN where `freedom` is 0.
     variance: Floats
-    freedom: Integers  #: Number of kept ranges minus the clocks and position unknowns; 0 without a fit; shape (T,).
+    freedom: Integers  #: Kept ranges minus clock and position unknowns, shape (T,); 0 without a fit.
 
 
 def map_information(trajectory: Trajectory, section: Indices) -> Floats:
-    """Return the inverse covariance of the map error across and up at sections, ECEF, shape (T, 3, 3) [1/m^2]."""
+    """Return the inverse ECEF covariance of the map error at sections of the line, shape (T, 3, 3) [1/m^2]."""
     return compute_information(trajectory.get_axes(section), trajectory.sigma_plan_m, trajectory.sigma_height_m)
 
 
 def compute_information(axes: Floats, sigma_plan_m: float, sigma_height_m: float) -> Floats:
-    """Return the inverse covariance of the map error, ECEF, shape (T, 3, 3) [1/m^2], from axes (T, 3, 3) and sigmas."""
+    """Return the inverse ECEF covariance of the map error from unit vectors along, across and up, shape (T, 3, 3)."""
     across, up = axes[:, 1], axes[:, 2]
     return np.asarray(
         across[:, :, None] * across[:, None, :] / sigma_plan_m**2 + up[:, :, None] * up[:, None, :] / sigma_height_m**2
@@ -59,12 +59,12 @@ def compute_information(axes: Floats, sigma_plan_m: float, sigma_height_m: float
 def robust_fit(
     ranges: Ranges, place_ecef_m: Floats, *, information: Floats | None = None, limits: RobustFitLimits | None = None
 ) -> RobustFit:
-    """Find the ranges of each epoch that agree with each other, by IGG-III weights (Yang, Song and Xu, 2002).
+    """Find the ranges of each epoch that agree with each other by a robust fit with IGG-III weights.
 
-    `place_ecef_m`, shape (T, 3), is the least-squares solution of all ranges, at which the ranges are linearised.
+    `place_ecef_m`, shape (T, 3), are the positions at which the ranges are linearised.
 
-    `information`, shape (T, 3, 3) [1/m^2], is the a-priori information on the position (`map_information`). The
-    position has one unknown with `information`, and three without.
+    `information`, shape (T, 3, 3) [1/m^2], is prior information on the position (`map_information`). With
+    `information`, one position unknown counts in the redundancy, otherwise three.
     """
     limits = limits or RobustFitLimits()
     used = ranges.weight > 0
@@ -93,9 +93,9 @@ def robust_on_line(
     near_ecef_m: Floats | None = None,
     limits: RobustFitLimits | None = None,
 ) -> RobustFit:
-    """Find the ranges that agree at positions on the line, by IGG-III weights (Yang, Song and Xu, 2002).
+    """Find the ranges that agree with each other at positions on the line (`robust_fit`).
 
-    Epochs without a position are fitted at `near_ecef_m`, shape (T, 3) [m], by default the middle of the line.
+    Without a position, ranges are linearised at `near_ecef_m`, shape (T, 3) [m]; default: the middle of the line.
     """
     antennas, arc = AntennaRows.on(line), position.arc_m
     if near_ecef_m is None:

@@ -1,8 +1,9 @@
-"""3-D positions from several constellations, with receiver clocks tied by biases estimated from earlier epochs.
+"""3-D positions from several constellations whose receiver clocks are tied by inter-system biases.
 
-The biases between the constellations' clocks are stable to a metre over hours. Once a bias is known, even a single
-satellite of a constellation contributes, and every satellite is checked against all others. Biases are estimated from
-earlier epochs only, so that results do not depend on the division of a log into chunks.
+An inter-system bias is the difference between the receiver clocks of two constellations. It is stable to a metre over
+hours. Once it is known, even a single satellite of a constellation contributes to the position and is tested by the
+other constellations. Biases are estimated from earlier epochs only, so that results do not depend on the division of a
+log into chunks.
 """
 
 from __future__ import annotations
@@ -28,34 +29,33 @@ from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases, Ranges
 class ClockOffsetLimits(Settings):
     """Limits of the inter-system biases."""
 
-    #: Standard deviation of a bias about its mean. With infinity, every constellation keeps a separate clock. On an
-    #: urban recording the standard deviation was 1.0 m (Galileo, BeiDou).
+    #: Standard deviation of a bias about its mean; 1.0 m on an urban recording (Galileo, BeiDou). With infinity, every
+    #: constellation has a separate clock.
     stability_m: float = Field(default=1.0, gt=0, allow_inf_nan=True)
-    #: Epochs closer together than this count as one sample, because the errors of a train at rest are correlated over
-    #: tens of seconds.
+    #: Epochs within this time count as one sample, because errors at standstill are correlated over tens of seconds.
     correlation_s: float = Field(default=30.0, gt=0)
-    #: Time constant of exponential forgetting. Biases are stable to a metre over hours; with this constant, the effect
-    #: of a receiver restart or of an undetected error decays within half an hour.
+    #: Time constant of exponential forgetting. With the default, the effect of a receiver restart or of an undetected
+    #: error decays within half an hour.
     window_s: float = Field(default=1800.0, gt=0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class OffsetState:
-    """Inter-system biases estimated so far, by letter of the clock."""
+    """Inter-system biases estimated so far, by clock letter."""
 
     information: Mapping[str, float] = field(default_factory=dict)  #: Inverse variance of a bias [1/m^2].
     moment: Mapping[str, float] = field(default_factory=dict)  #: Information times bias [1/m].
     #: Time of the last epoch, NaT before the first.
     last: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    age: float = 0.0  #: Age of the last epoch since the start of the log [windows].
+    age: float = 0.0  #: Age of the last epoch since the start of the log, in windows of `window_s`.
 
     def sums(self, letters: Sequence[str]) -> Floats:
-        """Return the information of G clocks, then their moments, shape (2 G,); 0 for clocks without a bias."""
+        """Return the information values of G clocks, then their moments, shape (2 G,); 0 for clocks without a bias."""
         of_each = (self.information, self.moment)
         return np.array([values.get(letter, 0.0) for values in of_each for letter in letters], dtype=np.float64)
 
     def later(self, letters: Sequence[str], sums: Floats, last: Dated) -> OffsetState:
-        """Return the state after epoch `last`, with the sums of some clocks replaced by `sums`."""
+        """Return the state after epoch `last`, in which the sums of `letters` are replaced by `sums`."""
         count = len(letters)
         return OffsetState(
             information={**self.information, **dict(zip(letters, sums[:count], strict=True))},
@@ -76,11 +76,11 @@ def tie_clocks(
     parts: Sequence[slice] = (EVERY,),
     limits: ClockOffsetLimits | None = None,
 ) -> tuple[InterSystemBiases, list[OffsetState]]:
-    """Estimate the inter-system biases at each epoch from earlier epochs (P1 3.3); return biases and new states.
+    """Estimate inter-system biases at each epoch from earlier epochs (P1 3.3); return the biases and the new states.
 
-    `ranges` are untied ranges that agree with each other, `clocks` are the letters of their clock groups, and `free`
-    are the positions from these ranges with separate clocks. `parts` are the rows of each receiver, one item for each
-    item of `states`.
+    `ranges` are ranges that agree with each other. `free` are the positions computed from them with a separate clock
+    for each constellation. `clocks` are the letters of the clocks. `parts` are the rows of each receiver; `states` has
+    one item per receiver.
     """
     limits = limits or ClockOffsetLimits()
     epochs = len(time)
@@ -120,12 +120,13 @@ def tie_clocks(
 class PointPositions(NamedTuple):
     """3-D positions of T epochs and the inter-system biases."""
 
-    point: SinglePoint  #: Conventional position, with a clock for each constellation.
-    tied: SinglePoint  #: Conventional position from the ranges tied by known biases.
-    free: SinglePoint  #: Position with separate clocks, from the ranges that are consistent with one 3-D position.
-    disagreeing: Masks  #: Used ranges that are inconsistent with the 3-D position of the other ranges, shape (T, K).
+    point: SinglePoint  #: Conventional position with one clock per constellation.
+    tied: SinglePoint  #: Conventional position with clocks tied by known biases.
+    free: SinglePoint  #: Position with one clock per constellation, from the ranges that agree with each other.
+    disagreeing: Masks  #: True for used ranges that disagree with the position `free`, shape (T, K).
     ties: InterSystemBiases
-    gross: Masks  #: Sole ranges of a clock that contradict the known biases by more than `GROSS_M`, shape (T, K).
+    #: True for the only range of a clock if it contradicts the known bias by more than `GROSS_M`, shape (T, K).
+    gross: Masks
 
 
 class TieLimits(NamedTuple):
@@ -147,11 +148,10 @@ def tie_constellations(
     parts: Sequence[slice] = (EVERY,),
     limits: TieLimits | None = None,
 ) -> tuple[Ranges, PointPositions, list[OffsetState]]:
-    """Return ranges tied by the inter-system biases known before each epoch, 3-D positions (P1 5), and the new states.
+    """Return ranges tied by known inter-system biases, 3-D positions (P1 5), and the new states.
 
-    Each additional constellation requires one satellite for its clock, unless the bias of this clock is known to a
-    metre. A bias is the difference of two receiver clocks, estimated with positions from ranges that agree with each
-    other, and averaged over earlier epochs. The results therefore do not depend on the division of a log into chunks.
+    Each additional constellation requires one satellite to estimate its clock, unless the bias of this clock is known
+    to a metre. Biases are estimated from ranges that agree with each other, and averaged over earlier epochs.
 
     Parameters
     ----------
@@ -163,9 +163,9 @@ def tie_constellations(
     near_ecef_m : array_like, shape (3,) or (T, 3) [m]
         Approximate positions.
     states : sequence of OffsetState
-        State of each receiver after the earlier epochs; the new states are returned.
+        State of each receiver after the previous chunk.
     reference : str, optional
-        Letter of the clock that biases refer to; by default the GPS clock, or the first clock if there is no GPS.
+        Letter of the reference clock of all biases; by default the GPS clock, or the first clock without GPS.
     parts : sequence of slice
         Epochs of each receiver.
     limits : TieLimits, optional
@@ -192,7 +192,7 @@ def tie_constellations(
 def _tie(
     ranges: Ranges, ties: InterSystemBiases, point: SinglePoint, start_ecef_m: Floats, limits: SinglePointLimits
 ) -> SinglePoint:
-    """Return 3-D positions with tied clocks, or with separate clocks at epochs where no bias is known yet."""
+    """Return 3-D positions with tied clocks; epochs without a known bias have separate clocks."""
     rows = ((ties.sigma_m < UNTIED_M).sum(axis=1) > 1).nonzero()[0]
     if not len(rows):
         return point
@@ -204,7 +204,7 @@ def _tie(
 def _agreeing(
     ranges: Ranges, point: SinglePoint, start_ecef_m: Floats, limits: TieLimits
 ) -> tuple[Ranges, SinglePoint, Masks]:
-    """Return the ranges that agree on one 3-D position, this position, and a mask of the ranges that disagree."""
+    """Return the ranges that agree on a 3-D position, this position, and a mask of the ranges that disagree with it."""
     dropped = (ranges.weight > 0) & ~robust_fit(ranges, start_ecef_m, limits=limits.robust_fit).kept
     changed = np.flatnonzero(dropped.any(axis=1))
     if not len(changed):

@@ -1,4 +1,4 @@
-"""Section search and constrained position on the line from the same ranges."""
+"""Section search and constrained position on the line."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from railfix.positioning.section_search import Section, SectionLimits, find_sect
 class FixLimits(NamedTuple):
     """Limits of the 3-D position, the section search and the position on the line."""
 
-    min_satellites: int = 3  #: Fewest satellites for a position; with 2, sections in sharp curves are wrong (P1 3.2).
+    min_satellites: int = 3  #: Minimum number of satellites; 2 lead to wrong sections in sharp curves (P1 3.2).
     single_point: SinglePointLimits = SinglePointLimits()
     section: SectionLimits = SectionLimits()
     constrained: ConstrainedLimits = ConstrainedLimits()
@@ -33,7 +33,7 @@ class FixLimits(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class LineFix(NotebookTable):
-    """3-D positions and positions on the line from the same ranges, T epochs."""
+    """3-D positions and positions on the line of T epochs, from the same ranges."""
 
     point: SinglePoint  #: 3-D position without the map.
     section: Section  #: Best-fitting vertex of the trajectory.
@@ -41,7 +41,7 @@ class LineFix(NotebookTable):
 
 
 def fix_on_line(ranges: Ranges, line: Line, point: SinglePoint, limits: FixLimits | None = None) -> LineFix:
-    """Compute section and position on the line (P1 2.2(2), (3)); NaN with fewer satellites than `min_satellites`."""
+    """Compute section and position on the line (P1 2.2(2), (3)); NaN for fewer than `min_satellites` satellites."""
     limits, antennas = limits or FixLimits(), AntennaRows.on(line)
     section = find_section(ranges, antennas, point, limits=limits.section)
     vertex = np.where(ranges.n_used >= limits.min_satellites, section.vertex, -1)
@@ -52,7 +52,7 @@ def fix_on_line(ranges: Ranges, line: Line, point: SinglePoint, limits: FixLimit
 
 
 def refit_epochs(ranges: Ranges, antennas: AntennaRows, fix: LineFix, epochs: Indices, limits: FixLimits) -> LineFix:
-    """Return `fix` with the positions of `epochs` (ascending) recomputed from `ranges`."""
+    """Return `fix` after recomputing the positions of `epochs` (ascending) from `ranges`."""
     for index, own in antennas.split(epochs):
         part = ranges.take(own)
         solved = fix_on_line(

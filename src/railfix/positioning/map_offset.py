@@ -1,8 +1,8 @@
-"""Mean offset of the 3-D positions from the line over minutes, for the detection of map errors.
+"""Detection of map errors from the mean offset of 3-D positions from the line.
 
 A constant offset can be smaller than the noise of a single epoch, but larger than the noise of the mean over a window.
-The covariance of the mean has three parts: noise, which the window averages; satellite and atmospheric errors, which
-are not averaged; and the stated error of the map.
+The covariance of the mean has three parts: noise, which decreases with the number of samples; satellite and atmospheric
+errors, which do not decrease; and the stated map error.
 """
 
 from __future__ import annotations
@@ -25,66 +25,67 @@ from railfix.positioning.noise_windows import correlated_sums
 from railfix.positioning.normal_equations import SinglePoint
 from railfix.positioning.range_arrays import RangeArrays, Ranges
 
-_SUMS: Final = 9  #: Number of sums per window.
+_SUMS: Final = 9  #: Number of sums of a window.
 
 
 class MapOffsetLimits(Settings):
-    """Limits of the test of the map against 3-D positions."""
+    """Limits of the map test with 3-D positions."""
 
-    #: Time constant of exponential forgetting. The default contains six independent samples, and is short enough to
-    #: detect local map errors.
+    #: Time constant of exponential forgetting. The default corresponds to six independent samples, and is short enough
+    #: to detect local map errors.
     window_s: float = Field(default=120.0, gt=0)
-    correlation_s: float = Field(default=20.0, gt=0)  #: Epochs closer together than this count as one sample.
-    least_samples: float = Field(default=3.0, gt=0)  #: Fewest independent samples for a decision.
-    #: Probability that noise alone causes the note on the map (chi-square, two degrees of freedom).
+    correlation_s: float = Field(default=20.0, gt=0)  #: Epochs within this time count as one sample.
+    least_samples: float = Field(default=3.0, gt=0)  #: Minimum number of independent samples for a decision.
+    #: Probability that noise alone causes a note on the map (chi-square, two degrees of freedom).
     note_risk: float = Field(default=1e-2, gt=0, lt=1)
-    #: Probability that noise alone causes the status of a wrong map, if the nominal sigmas are correct. On the
-    #: recordings, with a correct map and all screens, the statistic is below the threshold of 13.8
+    #: Probability that noise alone causes the status for a wrong map, if the nominal sigmas are correct. On recordings
+    #: with a correct map and all screens, the statistic is below the default threshold of 13.8
     #: (``tests/references/results/bounds.txt``).
     risk: float = Field(default=1e-3, gt=0, lt=1)
-    #: Probability that an offset of the smallest detectable size is missed.
+    #: Probability that the test misses an offset of the smallest detectable size.
     missed: float = Field(default=1e-2, gt=0, lt=1)
 
     @cached_property
     def note_threshold(self) -> float:
-        """Threshold of the statistic for a note on the run."""
+        """Threshold of the statistic for a note on the map."""
         return float(scipy.special.chdtri(2, self.note_risk))
 
     @cached_property
     def threshold(self) -> float:
-        """Threshold of the statistic for the status of epochs."""
+        """Threshold of the statistic for the status of an epoch."""
         return float(scipy.special.chdtri(2, self.risk))
 
     @cached_property
     def detectable_sigmas(self) -> float:
-        """Offset that the test for the status misses with the probability `missed` (non-central chi-square) [sigma]."""
+        """Smallest detectable offset in sigmas: the status test misses it with the probability `missed`."""
         return float(np.sqrt(scipy.special.chndtrinc(self.threshold, 2, self.missed)))
 
 
 @dataclass(frozen=True, kw_only=True)
 class MapOffsetState:
-    """State after the last epoch: sums with exponential forgetting (`MapOffsetLimits.window_s`)."""
+    """State after a chunk: sums with exponential forgetting (`MapOffsetLimits.window_s`)."""
 
     #: Time of the last epoch; NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    age: float = 0.0  #: Age of the last epoch since the start of the log [windows].
-    #: Nine sums over the epochs on the map, then nine over the epochs off the map, shape (18,): information matrix
-    #: (across, mixed, up), information times offset (2), covariance of nominal errors (3), and number of samples.
+    age: float = 0.0  #: Age of the last epoch since the start of the log, in windows of `window_s`.
+    #: Nine sums over the epochs on the map, then the same sums over the epochs off the map, shape (18,). The nine sums
+    #: are the information matrix (across, mixed, up), information times offset (2), covariance of satellite and
+    #: atmospheric errors (3), and number of samples.
     sums: Floats = field(default_factory=lambda: np.zeros(2 * _SUMS))
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class MapOffset(NotebookTable):
-    """Mean offset of the 3-D positions from the line over the window, T epochs; NaN before there are enough samples."""
+    """Mean offset of 3-D positions from the line over a window, T epochs; NaN with too few samples."""
 
-    across_m: Floats  #: Offset to the right of the line in the direction of rising chainage, shape (T,).
+    across_m: Floats  #: Offset to the right of the line, seen in the direction of rising chainage, shape (T,).
     up_m: Floats  #: Offset above the line, shape (T,).
-    #: Covariance across and up for a correct map: noise, satellite and atmospheric errors, and the stated error of the
-    #: map; shape (T, 2, 2).
+    #: Covariance of the offset for a correct map, shape (T, 2, 2): noise, satellite and atmospheric errors, and the
+    #: stated map error.
     covariance_m2: Floats
     statistic: Floats  #: Squared Mahalanobis distance of the offset from zero, shape (T,).
-    #: Smallest offset across, and smallest offset up, that the test detects without an offset in the other component;
-    #: smaller offsets are not excluded; shape (T, 2).
+    #: Smallest detectable lateral offset and smallest detectable vertical offset, shape (T, 2), if the other component
+    #: is 0.
     detectable_m: Floats
 
     @property
@@ -99,14 +100,14 @@ class MapOffset(NotebookTable):
 
     @property
     def seen(self) -> tuple[Floats, Floats]:
-        """Offset (T, 2) [m] and the inverse of its covariance (T, 2, 2) [1/m^2]; 0 with too few samples."""
+        """Offset, shape (T, 2) [m], and its inverse covariance, shape (T, 2, 2) [1/m^2]; 0 with too few samples."""
         known = np.isfinite(self.across_m)[:, None]
         offset = np.where(known, np.array([self.across_m, self.up_m]).T, 0.0)
         return offset, np.where(known[..., None], _inverse_2x2(self.covariance_m2), 0.0)
 
     @property
     def beyond_m(self) -> tuple[Floats, Floats]:
-        """Parts of the offset across and up beyond one sigma, shape (T,) each [m]; 0 with too few samples."""
+        """Lateral and vertical offset reduced by one sigma, shape (T,) each [m]; 0 with too few samples."""
         across = np.sign(self.across_m) * np.maximum(np.abs(self.across_m) - self.across_sigma_m, 0.0)
         up = np.sign(self.up_m) * np.maximum(np.abs(self.up_m) - self.up_sigma_m, 0.0)
         known = np.isfinite(self.across_m)
@@ -114,18 +115,18 @@ class MapOffset(NotebookTable):
 
 
 class OffsetErrors(NamedTuple):
-    """Range errors on which the map offset is based, for T epochs."""
+    """Range error statistics used for the map offset, T epochs."""
 
     nominal_m: Floats  #: Standard deviations of satellite and atmospheric errors, shape (T, M).
-    variance: Floats  #: Variance of the ranges as a multiple of the variance assumed by their weights, shape (T,).
+    variance: Floats  #: Ratio of the range variance to the variance assumed in the weights, shape (T,).
 
 
 class LinePositions(NamedTuple):
     """Positions on the line at T epochs."""
 
-    arc_m: Floats  #: Arc length; NaN without a position; shape (T,).
-    #: Epochs at which the train is off the line, shape (T,). The sums of these epochs are separate, because positions
-    #: off the line give no information on the map.
+    arc_m: Floats  #: Arc length, shape (T,); NaN without a position.
+    #: True for epochs at which the train is off the line, shape (T,). These epochs have separate sums, because
+    #: positions off the line contain no information on the map.
     off_map: Masks
 
 
@@ -140,7 +141,7 @@ def map_offset(
     *,
     limits: MapOffsetLimits | None = None,
 ) -> tuple[MapOffset, list[MapOffsetState]]:
-    """Compute the mean offset of 3-D positions from the line over the window up to each epoch; also return states."""
+    """Compute the mean offset of 3-D positions from the line over the window up to each epoch."""
     limits, (arc_m, off_map) = limits or MapOffsetLimits(), positions
     usable = np.isfinite(point.ecef_m[:, 0]) & np.isfinite(arc_m) & (ranges.space_redundancy > 0)
     arc = np.where(usable, arc_m, 0.0)
@@ -174,7 +175,7 @@ def map_offset(
 
 
 def offset_from_line(ecef_m: Floats, arc_m: Floats, antennas: AntennaRows) -> Floats:
-    """Return the offsets of 3-D positions (T, 3) from the line, right and up, (T, 2) [m]; NaN where `arc_m` is NaN."""
+    """Return the offsets of 3-D positions to the right of and above the line, shape (T, 2) [m]; NaN without `arc_m`."""
     known = np.isfinite(arc_m)
     arc = np.where(known, arc_m, 0.0)
     axes = antennas.get_axes(antennas.segment_at(arc))[:, 1:]
@@ -193,8 +194,9 @@ def terms_of_epochs(
 ) -> Floats:
     """Return the contribution of each epoch to the sums of its window (`MapOffsetState.sums`), shape (T, 9).
 
-    `ecef_m` are 3-D positions with covariances (T, 3, 3), `place_ecef_m` positions on the line (T, 3), and `axes` the
-    unit vectors across and up there (T, 2, 3). `nominal_m` (in C order) and `variance` are fields of `OffsetErrors`.
+    `ecef_m` are 3-D positions, `place_ecef_m` are the corresponding positions on the line, shape (T, 3), and `axes` are
+    the lateral and vertical unit vectors at the latter, shape (T, 2, 3). `nominal_m` (in C order) and `variance` are
+    fields of `OffsetErrors`.
     """
     offset = np.einsum("tij,tj->ti", axes, ecef_m - place_ecef_m)
     gain = (axes @ covariance_m2) @ (
@@ -217,8 +219,8 @@ def terms_of_epochs(
 def means_of_windows(
     sums: Floats, sigma_plan_m: float, sigma_height_m: float, detectable_sigmas: float
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return mean offset (T, 2), covariance (T, 2, 2), statistic (T,) and detectable offsets (T, 2) of sums (T, 9). The
-    results are fields of `MapOffset`. `detectable_sigmas` is a property of `MapOffsetLimits`.
+    """Return mean offset (T, 2), covariance (T, 2, 2), statistic (T,) and detectable offsets (T, 2) of window sums (T,
+    9). The results are described at `MapOffset`.
     """
     of_noise = _inverse_2x2(sums[:, [0, 1, 1, 2]].reshape(-1, 2, 2))
     mean = np.einsum("tij,tj->ti", of_noise, sums[:, 3:5])
@@ -237,5 +239,5 @@ def _inverse_2x2(matrix: Floats) -> Floats:
 
 
 def beyond_threshold(offset: MapOffset, limits: MapOffsetLimits) -> Masks:
-    """Return the epochs whose statistic exceeds the threshold of the status, shape (T,)."""
+    """Return True for epochs whose statistic exceeds the threshold for the status, shape (T,)."""
     return np.asarray(offset.statistic > limits.threshold)

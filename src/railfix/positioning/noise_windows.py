@@ -1,4 +1,4 @@
-"""Exponentially weighted sums over earlier epochs, for estimates of noise, clock and range biases and map offsets."""
+"""Exponentially weighted sums over earlier epochs, for estimates of noise, biases and map offsets."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ import numpy as np
 from railfix import kernels
 from railfix.core.arrays import Datetimes, Floats, Indices
 
-#: Time and age [windows] of an epoch; the time is NaT if there is no epoch.
+#: Time of an epoch, NaT if there is none, and its age [windows].
 Dated = tuple[np.datetime64, float]
 
 
 class Windows(NamedTuple):
-    """Ages of T epochs since the start of a log, concatenated for A antennas."""
+    """Ages of T epochs, counted in windows from the start of the log; the rows are those of A antennas in turn."""
 
-    step_s: Floats  #: Time since the previous epoch; 0 at the first epoch; shape (T,).
-    growth: Floats  #: Exponential of the age [windows] within the epoch's span (`kernels.windows.SPAN`), shape (T,).
-    decay: Floats  #: Decay factor of the running sums for spans begun since the previous epoch; 1 if none; shape (T,).
-    ends: Indices  #: Row after the last of each antenna, shape (A,).
+    step_s: Floats  #: Time since the previous epoch, shape (T,); 0 at the first epoch.
+    growth: Floats  #: Exponential of the age since the start of the epoch's span (`kernels.windows.SPAN`), shape (T,).
+    decay: Floats  #: Decay factor of the running sums, shape (T,); 1 unless a new span has begun.
+    ends: Indices  #: Row after each antenna's last row, shape (A,).
     last: list[Dated]  #: Last epoch of each antenna.
 
     @classmethod
     def of(
         cls, time: Datetimes, parts: Sequence[slice], before: Sequence[Dated], *, window_s: float, least_epochs: float
     ) -> Windows:
-        """Compute the ages from the rows (`parts`) and the last earlier epoch (`before`) of each antenna.
+        """Compute the ages; `parts` are the rows and `before` the last earlier epoch of each antenna.
 
-        A window is `window_s` or `least_epochs` epochs, whichever is longer. A gap therefore counts as at most 1 /
-        `least_epochs` of a window.
+        A window has the length `window_s` or `least_epochs` epochs, whichever is longer. A gap therefore counts as at
+        most 1 / `least_epochs` of a window.
         """
         times, ages = zip(*before, strict=True)
         ends = np.array([len(time) if rows.stop is None else rows.stop for rows in parts], dtype=np.intp)
@@ -43,10 +43,9 @@ class Windows(NamedTuple):
         return cls(step, np.exp(in_span), np.exp(-kernels.windows.SPAN * begun), ends, last)
 
     def sums(self, values: Floats, start: Floats) -> tuple[Floats, Floats]:
-        """Return sums of `values` (T, K) over all earlier epochs, each times ``exp(-difference of the ages)``.
+        """Return sums of `values` (T, K) over all earlier epochs with the weights ``exp(-age difference)``.
 
-        `start`, shape (A, K), are the running sums after the previous epochs; the running sums after the last epochs
-        are also returned.
+        `start`, shape (A, K), are the running sums of the previous chunk. The new running sums are also returned.
         """
         after, grown = np.array(start, dtype=np.float64), np.ascontiguousarray(self.growth[:, None] * values)
         return kernels.windows.decayed_sums(grown, self.growth, self.decay, after, self.ends), after
@@ -62,12 +61,11 @@ def correlated_sums(
     window_s: float,
     correlation_s: float,
 ) -> tuple[Floats, Floats, Floats, list[Dated]]:
-    """Compute sums over a window of epochs whose errors are correlated over `correlation_s`.
+    """Compute exponentially weighted sums over epochs with errors that are correlated over `correlation_s`.
 
-    The weight of an epoch is the time since the previous epoch divided by `correlation_s`, at most 1. `start` is
-    described at `Windows.sums`, `parts` and `before` at `Windows.of`. Returns the decayed sums before each epoch (T,
-    K), the weighted values of each epoch (T, K), the running sums after the last epochs (A, K), and the last epoch of
-    each antenna.
+    The weight of an epoch is the time since the previous epoch divided by `correlation_s`, but at most 1. For the other
+    arguments, see `Windows.of` and `Windows.sums`. Return the sums before each epoch (T, K), the weighted values of
+    each epoch (T, K), the running sums after the last epochs (A, K), and the last epoch of each antenna.
     """
     windows = Windows.of(time, parts, before, window_s=window_s, least_epochs=window_s / correlation_s)
     own = np.minimum(windows.step_s / correlation_s, 1.0)[:, None] * values

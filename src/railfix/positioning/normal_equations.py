@@ -1,13 +1,13 @@
-"""Normal equations of ranges without receiver clocks, constrained positions, and 3-D single point positions.
+"""Normal equations without receiver clocks, constrained positions on the line, and 3-D single-point positions.
 
-Subtracting the weighted mean over the satellites of a constellation from their residuals and design rows is equivalent
-to solving for the clock of the constellation (the Schur complement of the clock block). Where the biases between the
-clocks are known with a sigma (`InterSystemBiases`), each mean minus the bias is an observation of a common clock, and
-the common clock is eliminated likewise.
+The clock of a constellation is eliminated by subtracting the weighted mean over its satellites from their residuals and
+design rows. This is equivalent to solving for the clock (Schur complement of the clock block). With known biases
+(`InterSystemBiases`), each mean minus its bias is an observation of a common clock, which is eliminated in the same
+way.
 
-P1 2.2(3): the antenna is at ``R = r_i + d e_i`` on the section between two points of its trajectory. The map's plan and
-height errors are two unknowns with their covariance as prior, which is equivalent to an additional covariance
-``H_m S_m H_m^T`` of the ranges. The single point is the reference method of P1 section 5.
+In P1 2.2(3), the antenna is at ``R = r_i + d e_i`` on the section between two points of its trajectory. The plan and
+height errors of the map are two unknowns with their covariance as prior. This is equivalent to an additional covariance
+``H_m S_m H_m^T`` of the ranges. The single-point position is the reference method of P1 section 5.
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ class NormalEquations:
     """Normal equations of a position from ranges, with the receiver clocks eliminated."""
 
     matrix: Floats  #: Normal matrix of the position in ECEF, shape (T, 3, 3) [1/m^2].
-    vector: Floats  #: Right-hand side; the least-squares step is ``matrix^-1 vector``; shape (T, 3) [1/m].
-    wsse: Floats  #: Weighted sum of squared residuals at the position itself, shape (T,).
-    #: Receiver clock of each group at the position; NaN where the group has no satellite; shape (T, G).
+    vector: Floats  #: Right-hand side, shape (T, 3) [1/m]. The least-squares step is ``matrix^-1 vector``.
+    wsse: Floats  #: Weighted sum of squared residuals at the linearisation position, shape (T,).
+    #: Receiver clock of each group at the linearisation position, shape (T, G); NaN for groups without satellites.
     clock_m: Floats
-    residual_m: Floats  #: Code - range - clock; 0 where the weight is 0; shape (T, M).
+    residual_m: Floats  #: Code - distance - clock, shape (T, M); 0 where the weight is 0.
     clock_slope: Floats  #: Decrease of `clock_m` per metre of a step along each axis, shape (T, 3, G).
     design: Floats  #: Decrease of `residual_m` per metre of a step along each axis, shape (T, 3, M).
 
 
 def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
-    """Return the normal equations of `ranges` linearised at one position per epoch, shape (T, 3) [m]."""
+    """Return the normal equations of `ranges`, linearised at positions of shape (T, 3) [m]."""
     system, means, rows, seen = kernels.ranges.reduced_equations(ranges.arrays, kernel_array(place_ecef_m))
     return NormalEquations(
         matrix=system[:, :3, :3], vector=system[:, :3, 3], wsse=system[:, 3, 3],
@@ -54,10 +54,10 @@ def normal_equations(ranges: Ranges, place_ecef_m: Floats) -> NormalEquations:
 
 
 def misfit(ranges: Ranges, place_ecef_m: Floats, epochs: Indices | None = None) -> Floats:
-    """Return the weighted sum of squared residuals at positions (n, 3) [m], with the clocks eliminated, shape (n,).
+    """Return the weighted sum of squared residuals at n positions, shape (n,), with the clocks eliminated.
 
-    Same as `normal_equations(...).wsse`, without the derivatives. `epochs` has the index of each position's epoch; by
-    default, there is one position per epoch, in order.
+    The result equals `normal_equations(...).wsse`. `epochs` has the index of each position's epoch; by default, there
+    is one position per epoch.
     """
     of = np.arange(len(ranges)) if epochs is None else epochs
     return kernels.ranges.misfits(ranges.arrays, kernel_array(place_ecef_m), of)
@@ -66,26 +66,26 @@ def misfit(ranges: Ranges, place_ecef_m: Floats, epochs: Indices | None = None) 
 class ConstrainedLimits(Settings):
     """Limits of the iteration along the line."""
 
-    #: Step length below which the iteration ends inside a section; the error is 0.03 mm (`railfix.kernels.ranges`).
+    #: Step length below which the iteration ends; the remaining error is at most 0.03 mm.
     tolerance_m: float = Field(default=5.0, gt=0)
-    max_iterations: int = Field(default=40, ge=1)  #: Largest number of steps, including steps to another section.
+    max_iterations: int = Field(default=40, ge=1)  #: Largest number of steps, including section changes.
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Constrained(NotebookTable):
     """Positions along the line, T epochs."""
 
-    arc_m: Floats  #: Arc length; NaN where the iteration did not converge or was not started; shape (T,).
-    section: Indices  #: Section that contains the position, -1 without a position; shape (T,).
+    arc_m: Floats  #: Arc length, shape (T,); NaN without a position or without convergence.
+    section: Indices  #: Section that contains the position, shape (T,); -1 without a position.
     sigma_m: Floats  #: Standard deviation along the line from the weights and the map error, shape (T,).
-    exact_map_sigma_m: Floats  #: Part of `sigma_m` from the weights alone, as for an exact map; shape (T,).
-    #: Sigma along the line for unit weights and an exact map; infinite where not determined; shape (T,).
+    exact_map_sigma_m: Floats  #: Standard deviation along the line for an exact map, shape (T,).
+    #: Standard deviation along the line for unit weights and an exact map, shape (T,); infinite if undetermined.
     dilution: Floats
-    #: Distance beyond an end of the line that the ranges imply if the position is clamped to the end; else 0; (T,).
+    #: Distance beyond the end of the line at which the ranges fit best, shape (T,); 0 for positions not at an end.
     overshoot_m: Floats
     clock_m: Floats  #: Receiver clock of each group, shape (T, G).
-    wsse: Floats  #: Weighted sum of squared residuals, with the map error taken into account; shape (T,).
-    residual_m: Floats  #: Code - range - clock at the position on the line, shape (T, M).
+    wsse: Floats  #: Weighted sum of squared residuals, including the map error, shape (T,).
+    residual_m: Floats  #: Code - distance - clock at the position on the line, shape (T, M).
     iterations: Integers  #: Number of steps, shape (T,).
 
 
@@ -94,10 +94,10 @@ def position_on_line(
 ) -> Constrained:
     """Compute the distance along the line by constrained least squares (P1 2.2(3)): ``R = r_i + d e_i``.
 
-    The iteration consists of Newton steps in d inside a section, with the receiver clocks eliminated. A step beyond an
-    end of the section stops at this end, and the iteration continues in the neighbouring section. Where the steps from
-    both neighbouring sections lead back to their common point, that point is the solution. At an open end of the line,
-    the position is clamped to the end, and `overshoot_m` is the distance beyond the end implied by the ranges.
+    Within a section, the iteration uses Newton steps in d, with the receiver clocks eliminated. A step beyond an end of
+    the section stops at this end, and the iteration continues in the neighbouring section. If the steps in two
+    neighbouring sections lead back to their common point, this point is the solution. Positions beyond an end of the
+    line are clamped to the end; `overshoot_m` is the distance beyond it.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def position_on_line(
     line : Trajectory, SearchIndex or AntennaRows
         Trajectory of the antenna.
     vertex : ndarray of int, shape (T,)
-        Initial point (`Section.vertex` of `find_section`); -1 where no position is computed.
+        Initial trajectory point (`Section.vertex` of `find_section`); -1 for epochs without a position.
     limits : ConstrainedLimits, optional
     """
     limits = limits or ConstrainedLimits()
@@ -132,10 +132,10 @@ def position_on_line(
 def _on_line(
     ranges: Ranges, trajectory: Trajectory, start: Indices, limits: ConstrainedLimits
 ) -> tuple[Floats, Indices, Floats, Floats, Floats, Integers]:
-    """Return arc lengths (T,), and the results of `_from` with the epochs on the last axis.
+    """Return arc lengths, and the results of `_from` with epochs on the last axis.
 
-    Where the position is clamped to an end of a closed line, the iteration is repeated from the point at which the line
-    continues. The better fit is kept.
+    If a position is clamped to an end of a closed line, the iteration is repeated from the point where the line
+    continues, and the better fit is returned.
     """
     section, solved, clock, residual, iterations = _from(start, ranges, trajectory, limits)
     for end, join in zip((0, len(trajectory) - 2), trajectory.joins_m, strict=True):
@@ -156,7 +156,7 @@ def _on_line(
 def _from(
     vertex: Indices, ranges: Ranges, trajectory: Trajectory, limits: ConstrainedLimits
 ) -> tuple[Indices, Floats, Floats, Floats, Integers]:
-    """Run `kernels.ranges.iterate_along` on a trajectory from its points `vertex`."""
+    """Run `kernels.ranges.iterate_along`, starting at the trajectory points `vertex`."""
     line = SectionArrays(
         trajectory.ecef_m[:-1], trajectory.tangent, trajectory.across, trajectory.up, trajectory.length_m,
         trajectory.sigma_plan_m, trajectory.sigma_height_m,
@@ -165,7 +165,7 @@ def _from(
 
 
 class SectionArrays(NamedTuple):
-    """Arrays of the S sections of a line, and the sigmas of its map."""
+    """Arrays of S line sections, and the map sigmas."""
 
     start_ecef_m: Floats  # (S, 3)
     tangent: Floats  # (S, 3)
@@ -177,13 +177,13 @@ class SectionArrays(NamedTuple):
 
 
 class SinglePointLimits(Settings):
-    """Limits of the iterative solution of 3-D positions, and of its validation (`conventional_status`)."""
+    """Limits of the iteration for 3-D positions, and of the validation of these positions (`conventional_status`)."""
 
-    tolerance_m: float = Field(default=1.0, gt=0)  #: Step length below which the iteration ends; the error is 0.01 mm.
+    tolerance_m: float = Field(default=1.0, gt=0)  #: Step length below which the iteration ends.
     max_iterations: int = Field(default=12, ge=1)  #: Largest number of steps.
     #: False-alarm probability of the chi-square test of the residuals.
     false_alarm: float = Field(default=1e-3, gt=0, lt=0.5)
-    #: Largest position dilution of precision; RTKLIB limits the geometric dilution of precision to 30.
+    #: Largest position dilution of precision. RTKLIB limits the geometric dilution of precision to 30.
     dilution_limit: float = Field(default=30.0, gt=0)
 
 
@@ -191,23 +191,24 @@ class SinglePointLimits(Settings):
 class SinglePoint(RowArrays, NotebookTable):
     """3-D positions, T epochs."""
 
-    ecef_m: Floats  #: NaN with too few satellites, singular geometry, or no convergence; shape (T, 3).
+    ecef_m: Floats  #: Position, shape (T, 3); NaN with too few satellites, singular geometry or no convergence.
     clock_m: Floats  #: Receiver clock of each group, shape (T, G).
     matrix: Floats  #: Normal matrix at the position, shape (T, 3, 3) [1/m^2].
-    covariance_m2: Floats  #: Covariance of the position, from the weights; shape (T, 3, 3).
+    covariance_m2: Floats  #: Position covariance according to the weights, shape (T, 3, 3).
     wsse: Floats  #: Weighted sum of squared residuals, shape (T,).
-    residual_m: Floats  #: Code - range - clock, shape (T, M).
+    residual_m: Floats  #: Code - distance - clock, shape (T, M).
 
 
 def point_position(ranges: Ranges, near_ecef_m: ArrayLike, *, limits: SinglePointLimits | None = None) -> SinglePoint:
-    """Compute 3-D positions without the map (P1 5, conventional method), with a clock per constellation unless tied.
+    """Compute 3-D positions without the map (P1 5, conventional method), with one clock per constellation or tied
+    clocks.
 
     Parameters
     ----------
     ranges : Ranges
         Returned by `weighted_ranges`.
     near_ecef_m : array_like, shape (3,) or (T, 3) [m]
-        Initial positions, accurate to a few thousand kilometres.
+        Initial positions, with errors of up to a few thousand kilometres.
     limits : SinglePointLimits, optional
     """
     limits = limits or SinglePointLimits()

@@ -1,6 +1,6 @@
-"""Weighted pseudoranges: input arrays of the positioning stages.
+"""Weighted pseudoranges, the input of the positioning stages.
 
-Arguments are checked here, at the interface; the stages and the compiled functions do not check them again.
+`weighted_ranges` checks its arguments. The stages and the compiled functions do not check them again.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ UNTIED_M: Final = 1e6  #: Sigma of an unknown inter-system bias [m].
 class InterSystemBiases(RowArrays, NotebookTable):
     """Known offsets between the receiver clocks of the constellations."""
 
-    #: Receiver clock of each group minus a clock common to all groups; arbitrary but finite where unknown; (T, G).
+    #: Receiver clock of each group minus the common clock, shape (T, G); any finite value where unknown.
     offset_m: Floats
-    sigma_m: Floats  #: Standard deviation of `offset_m`; `UNTIED_M` where the offset is unknown; shape (T, G).
+    sigma_m: Floats  #: Standard deviation of `offset_m`, shape (T, G); `UNTIED_M` where unknown.
 
 
 class RangeArrays(NamedTuple):
@@ -38,21 +38,21 @@ class RangeArrays(NamedTuple):
     code_m: Floats  # (T, M)
     weight: Floats  # (T, M)
     starts: Indices  # (G,) first channel of each group
-    offset_m: Floats  # (T, G), of `InterSystemBiases`; (0, G) without ties
-    sigma_m: Floats  # (T, G), of `InterSystemBiases`; (0, G) without ties
+    offset_m: Floats  # (T, G), see `InterSystemBiases`; (0, G) without ties
+    sigma_m: Floats  # (T, G), see `InterSystemBiases`; (0, G) without ties
 
     @property
     def tied(self) -> bool:
-        """Whether there are inter-system biases."""
+        """True with inter-system biases."""
         return len(self.offset_m) == len(self.code_m)
 
     @property
     def clock(self) -> Indices:
-        """Index of the group of each channel, shape (M,)."""
+        """Group index of each channel, shape (M,)."""
         return self.starts.searchsorted(np.arange(self.code_m.shape[1]), side="right") - 1
 
     def take(self, epochs: Masks | Indices | slice) -> RangeArrays:
-        """Return the arrays of some epochs."""
+        """Return the arrays of selected epochs."""
         ties = (self.offset_m[epochs], self.sigma_m[epochs]) if self.tied else (self.offset_m, self.sigma_m)
         arrays = (self.sat_ecef_m[epochs], self.code_m[epochs], self.weight[epochs], *ties)
         sat_ecef_m, code_m, weight, *known = map(kernel_array, arrays)
@@ -61,19 +61,19 @@ class RangeArrays(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Ranges:
-    """Corrected pseudoranges of an antenna, ready to be fitted: T epochs by M channels."""
+    """Corrected and weighted pseudoranges of an antenna, T epochs by M channels."""
 
-    sat_ecef_m: Floats  #: Satellites in ECEF at transmit time; arbitrary but finite where the weight is 0; (T, M, 3).
-    code_m: Floats  #: Corrected pseudorange; arbitrary but finite where the weight is 0; shape (T, M).
-    weight: Floats  #: 1/sigma^2, 0 for unused ranges; shape (T, M) [1/m^2].
-    groups: tuple[slice, ...]  #: Channels of each receiver clock, which are adjacent; one slice per clock.
-    ties: InterSystemBiases | None = None  #: Known offsets between the clocks; None for separate clocks.
+    sat_ecef_m: Floats  #: ECEF satellite positions at transmission, shape (T, M, 3); any finite value if unused.
+    code_m: Floats  #: Corrected pseudoranges, shape (T, M); any finite value for unused ranges.
+    weight: Floats  #: Weights 1/sigma^2, shape (T, M) [1/m^2]; 0 for unused ranges.
+    groups: tuple[slice, ...]  #: Adjacent channels of each receiver clock, one slice per clock.
+    ties: InterSystemBiases | None = None  #: Known clock offsets; None for separate clocks.
 
     def __len__(self) -> int:
         return len(self.code_m)
 
     def take(self, epochs: Masks | Indices) -> Ranges:
-        """Return the ranges of some epochs, by mask or index."""
+        """Return the ranges of selected epochs."""
         return Ranges(
             sat_ecef_m=self.sat_ecef_m[epochs], code_m=self.code_m[epochs], weight=self.weight[epochs],
             groups=self.groups, ties=None if self.ties is None else self.ties.take(epochs),
@@ -89,7 +89,7 @@ class Ranges:
 
     @cached_property
     def n_used(self) -> Integers:
-        """Number of used ranges (with a weight above 0), shape (T,)."""
+        """Number of used ranges, shape (T,)."""
         return np.asarray((self.weight > 0).sum(axis=1), dtype=np.int64)
 
     @cached_property
@@ -99,7 +99,7 @@ class Ranges:
 
     @cached_property
     def n_clocks(self) -> Integers:
-        """Number of clocks with at least one used range, shape (T,); all tied clocks together count as one."""
+        """Number of clocks with at least one used range, shape (T,). All tied clocks together count as one clock."""
         seen = np.add.reduceat(self.weight, self.starts, axis=1) > 0
         if self.ties is None:
             return np.asarray(seen.sum(axis=1), dtype=np.int64)
@@ -108,38 +108,38 @@ class Ranges:
 
     @property
     def redundancy(self) -> Integers:
-        """Number of used ranges minus the clocks and the distance along the line, shape (T,); can be negative."""
+        """Redundancy on the line, used ranges minus clocks minus 1, shape (T,); can be negative."""
         return np.asarray(self.n_used - self.n_clocks - 1, dtype=np.int64)
 
     @property
     def space_redundancy(self) -> Integers:
-        """Number of used ranges minus the clocks and three coordinates, shape (T,); can be negative."""
+        """Redundancy of a 3-D position, used ranges minus clocks minus 3, shape (T,); can be negative."""
         return np.asarray(self.n_used - self.n_clocks - 3, dtype=np.int64)
 
 
-#: Satellite position that replaces missing positions of unused ranges; an arbitrary finite value [m].
+#: Arbitrary finite satellite position of unused ranges [m].
 FILLER_SATELLITE_M: Final = (2.6e7, 0.0, 0.0)
 
 
 def weighted_ranges(
     sat_ecef_m: ArrayLike, code_m: ArrayLike, sigma_m: ArrayLike, clock: Sequence[str] | Strings
 ) -> Ranges:
-    """Return ranges to be fitted, with weights ``1/sigma^2`` (P1 2.2(3)); 0 where code, sigma or satellite is NaN.
+    """Return ranges with the weights ``1/sigma^2`` (P1 2.2(3)), or 0 where code, sigma or satellite is NaN.
 
     Parameters
     ----------
     sat_ecef_m : array_like, shape (T, M, 3) [m]
-        Satellites at the times of transmission, Earth-fixed.
+        Satellite positions at the times of transmission, ECEF.
     code_m, sigma_m : array_like, shape (T, M) [m]
         Corrected pseudoranges and their standard deviations; NaN for unused codes.
     clock : sequence of str, length M
-        Letter of the constellation or receiver clock of each channel; channels of one clock must be adjacent.
+        Letter of the constellation or receiver clock of each channel. Channels of one clock must be adjacent.
 
     Raises
     ------
     ValueError
-        Shapes do not match, an array is not numeric or has single precision, a standard deviation is not positive,
-        a satellite or a code is at an impossible distance, or a letter denotes no constellation.
+        Shapes do not match, an array is not numeric or has single precision, a standard deviation is not positive, a
+        code or satellite position is impossible, or a letter denotes no constellation.
     """
     code = _check_floats("code_m", code_m, 2)
     sigma = _check_floats("sigma_m", sigma_m, 2)
@@ -176,7 +176,7 @@ def weighted_ranges(
 
 
 def _check_floats(name: str, values: ArrayLike, axes: int) -> Floats:
-    """Return values in double precision; raise ValueError for other types or a wrong number of axes."""
+    """Return values in double precision; raise ValueError for an unsuitable type or number of axes."""
     array = np.asarray(values)
     if array.dtype.kind not in "fiu" or (array.dtype.kind == "f" and array.dtype.itemsize < 8):
         raise ValueError(
@@ -189,5 +189,5 @@ def _check_floats(name: str, values: ArrayLike, axes: int) -> Floats:
 
 
 def without(ranges: Ranges, dropped: Masks) -> Ranges:
-    """Return the ranges with weight 0 where `dropped`, shape (T, M)."""
+    """Return the ranges after setting the weights of `dropped` ranges to 0."""
     return replace(ranges, weight=np.where(dropped, 0.0, ranges.weight))

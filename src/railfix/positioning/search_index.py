@@ -1,4 +1,4 @@
-"""Search structures of a trajectory: k-d tree of its points, and stretches at several levels of length."""
+"""Search structures of a trajectory: k-d tree of its points, and stretches of different lengths."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from railfix.track.trajectory import Trajectory
 
 
 class SearchIndex:
-    """K-d tree and stretches of a trajectory, built once and used in many searches."""
+    """K-d tree and stretches of a trajectory."""
 
     def __init__(self, trajectory: Trajectory) -> None:
         self.trajectory = trajectory
@@ -22,8 +22,8 @@ class SearchIndex:
         self._clear_m = np.full(len(trajectory.length_m), np.nan)
         points = trajectory.ecef_m
         self.tree = scipy.spatial.cKDTree(points)  #: k-d tree of the trajectory points.
-        #: For each level of length: indices of the middle points of the stretches, and radii [m] that contain the
-        #: stretches.
+        #: For each stretch length: index of the middle point of each stretch, and radius [m] around it that contains
+        #: the stretch.
         self.levels: list[tuple[Indices, Floats]] = []
         count, size = len(points), 1
         while True:
@@ -37,19 +37,19 @@ class SearchIndex:
 
     @cached_property
     def stretches(self) -> tuple[Indices, Floats, Indices]:
-        """Middle points and radii [m] of the stretches of all levels, shape (S,), and the first index of each level."""
+        """Middle points and radii [m] of all stretches, shape (S,), and the first index of each stretch length."""
         middles, radii = zip(*self.levels, strict=True)
         return np.concatenate(middles), np.concatenate(radii), np.cumsum([0, *map(len, middles)])
 
     @cached_property
     def arc_of_points_m(self) -> Floats:
-        """Arc length of each point, shape (V,) [m]; the smallest value if the line passes the point several times."""
+        """Arc length of each point, shape (V,) [m]; the smallest if the line passes the point several times."""
         return self.trajectory.nearest(self.trajectory.ecef_m)[0]
 
     def clear_of_tangent_m(self, arc_m: Floats) -> Floats:
-        """Return a horizontal radius around each position within which the line lies on the tangent, shape (T,) [m].
+        """Return a horizontal radius around each position within which the line is on its tangent, shape (T,) [m].
 
-        The radius, at most `CLEAR_M`, is computed once per section, and is valid for all positions on the section.
+        The radius is at most `CLEAR_M` and is valid for all positions on a section.
         """
         line = self.trajectory
         section = line.segment_at(arc_m)[0]

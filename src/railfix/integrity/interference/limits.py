@@ -1,4 +1,4 @@
-"""Suspected causes of interference, limits of the interference tests, and statistics of C/N0 and front-end gain."""
+"""Signs of interference, limits of the interference tests, and statistics of C/N0 and front-end gain."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ class Suspicion(IntEnum):
     NONE = 0
     JAMMING_SUSPECTED = 1
     SPOOFING_SUSPECTED = 2
-    #: One common error of the time tags explains the ranges of all satellites.
+    #: A common time-tag error explains the ranges of all satellites.
     TIME_TAGS = 3
-    #: The 3-D positions have left the map, without a sign of spoofing or of a time-tag error.
+    #: The 3-D positions have left the map; there is no sign of spoofing or of a time-tag error.
     LEFT_MAP = 4
     #: All positions of the last minute failed a check; the cause is unknown.
     CONTRADICTED = 5
@@ -42,21 +42,21 @@ class Sign(IntFlag):
     GAIN_FALL = 1 << 2
     #: The receiver reports spoofing in UBX SEC-SIG (affirmed) or SBF RFStatus.
     RECEIVER_SPOOFING = 1 << 3
-    #: All satellites have the same C/N0, as from one transmitter.
+    #: All satellites have the same C/N0, which is typical of a single transmitter.
     EQUAL_CN0 = 1 << 4
-    #: The receiver clock steps relative to the Dopplers, or the clock drift steps.
+    #: The code ranges of all satellites step relative to their Dopplers, or the clock drift jumps.
     CLOCK_JUMP = 1 << 5
     #: The 3-D velocity changes faster than a train can.
     SPEED_JUMP = 1 << 6
     #: The 3-D position moves farther than a train can.
     POSITION_JUMP = 1 << 7
-    #: Two constellations give different positions or receiver clocks.
+    #: The positions or receiver clocks computed from two constellations differ.
     CONSTELLATIONS_PART = 1 << 8
     #: Consistent 3-D positions have left the map laterally.
     LEFT_MAP = 1 << 9
-    #: The distance between satellite positions deviates from the wheel distance.
+    #: The distance travelled according to GNSS deviates from the wheel distance.
     WHEEL_PARTS = 1 << 10
-    #: One common error of the time tags explains the ranges.
+    #: A common time-tag error explains the ranges.
     TIME_TAGS = 1 << 11
     #: All positions of the last minute failed a check.
     CONTRADICTED = 1 << 12
@@ -71,91 +71,93 @@ CAUSES: Final = tuple(cause for cause in Sign if cause)  #: All signs but NONE, 
 
 
 class InterferenceLimits(Settings):
-    """Limits of the signs of interference.
+    """Limits of the interference tests.
 
-    With the default limits, no sign occurs on the recordings used for tests; the largest statistics on these recordings
-    are in ``tests/references/results/interference.txt``.
+    With the default limits, no sign occurs on the test recordings. The file
+    ``tests/references/results/interference.txt`` lists the largest statistics of these recordings.
     """
 
     use: Literal["on", "off"] = "on"
-    least_satellites: int = Field(default=6, ge=5)  #: Minimum number of satellites for a test that compares satellites.
-    #: Minimum fall of C/N0 below the recent peak, computed as the median over all satellites.
+    least_satellites: int = Field(default=6, ge=5)  #: Minimum number of satellites in a comparison of satellites.
+    #: Minimum fall of C/N0 below its recent peak that counts as a sign; median over all satellites.
     fall_db: float = Field(default=5.0, gt=0)
-    #: Largest standard deviation of the falls over the satellites. A jammer raises the noise of all channels equally;
-    #: walls and roofs do not.
+    #: Largest standard deviation, over the satellites, of the C/N0 falls caused by jamming. A jammer raises the noise
+    #: of all channels equally; walls and roofs do not.
     spread_db: float = Field(default=1.5, gt=0)
-    peak_decay_db_per_min: float = Field(default=1.0, gt=0)  #: Decay rate of the recent C/N0 peak [dB/min].
-    known_after_s: float = Field(default=10.0, ge=0)  #: Tracking time after which a satellite's C/N0 is used.
-    #: Minimum fall of the front-end gain, as a fraction of the recent peak. While a receiver starts without
-    #: interference, the fall reaches 14 %.
+    peak_decay_db_per_min: float = Field(default=1.0, gt=0)  #: Decay rate of each satellite's C/N0 peak.
+    known_after_s: float = Field(default=10.0, ge=0)  #: Tracking time from which a satellite's C/N0 is used.
+    #: Minimum fall of the front-end gain, as a fraction of its recent peak, that counts as a sign. At receiver
+    #: start-up, the gain falls by up to 14 % without interference.
     gain_fall: float = Field(default=0.3, gt=0, lt=1)
-    #: Standard deviation of C/N0 over the satellites up to which C/N0 counts as equal. In open sky, this standard
-    #: deviation is 1.2 dB or more.
+    #: Largest standard deviation, over the satellites, of C/N0 values that count as equal. On the test recordings, this
+    #: standard deviation is at least 1.2 dB.
     equal_db: float = Field(default=0.8, gt=0)
-    #: Minimum step of the codes relative to the Dopplers, whole milliseconds subtracted. Phone clocks step by 30 m.
+    #: Minimum step of the codes relative to the Dopplers that counts as a sign, after removal of whole milliseconds.
+    #: Phone clocks step by 30 m without interference.
     clock_jump_m: float = Field(default=60.0, gt=0)
-    drift_jump_mps: float = Field(default=10.0, gt=0)  #: Minimum jump of the clock drift.
-    speed_jump_mps: float = Field(default=5.0, gt=0)  #: Minimum jump of the 3-D velocity.
-    position_jump_m: float = Field(default=30.0, gt=0)  #: Minimum jump of the 3-D position.
-    #: Minimum distance of the 3-D position from the line that counts as a sign. A yard is some 100 m wide.
+    drift_jump_mps: float = Field(default=10.0, gt=0)  #: Minimum jump of the clock drift that counts as a sign.
+    speed_jump_mps: float = Field(default=5.0, gt=0)  #: Minimum jump of the 3-D velocity that counts as a sign.
+    position_jump_m: float = Field(default=30.0, gt=0)  #: Minimum jump of the 3-D position that counts as a sign.
+    #: Minimum distance of the 3-D position from the line that counts as a sign. A yard is about 100 m wide.
     off_map_m: float = Field(default=100.0, gt=0)
-    #: Minimum estimated error of the time tags. For correct tags, the estimated error reaches 0.05 s in towns, and
-    #: 0.13 s with a phone and seven satellites.
+    #: Minimum estimated time-tag error that counts as a sign. For correct time tags, the estimated error reaches 0.05 s
+    #: in towns, and 0.13 s with a phone and seven satellites.
     tag_error_s: float = Field(default=0.1, gt=0)
-    tag_sigmas: float = Field(default=6.0, gt=0)  #: Minimum estimated error of the time tags, in standard deviations.
-    #: Time for which all positions must fail a check before positions are considered unreliable.
+    tag_sigmas: float = Field(default=6.0, gt=0)  #: Minimum estimated time-tag error in standard deviations.
+    #: Time for which all positions must fail a check to be a sign of interference.
     contradicted_s: float = Field(default=60.0, gt=0)
-    #: Minimum of each jump, and of the excess of the distance from the line over `position_jump_m`, in sigmas.
+    #: Minimum jump of clock drift, velocity and position in standard deviations. The same minimum applies to the
+    #: distance from the line, after `position_jump_m` is subtracted.
     jump_sigmas: float = Field(default=10.0, gt=0)
-    #: Minimum difference between the positions and clocks of two constellations, in standard deviations.
+    #: Minimum difference, in standard deviations, between the positions and clocks of two constellations.
     part_sigmas: float = Field(default=15.0, gt=0)
-    #: Largest acceleration of a train. A jump is the part of a change that exceeds what a train can do.
+    #: Largest acceleration of a train. Only the part of a change that exceeds this acceleration counts as a jump.
     acceleration_mps2: float = Field(default=2.0, gt=0)
     max_speed_mps: float = Field(default=100.0, gt=0)  #: Largest speed of a train.
     longest_gap_s: float = Field(default=10.0, gt=0)  #: Largest interval between two epochs that are compared.
     largest_speed_sigma_mps: float = Field(default=2.0, gt=0)  #: Largest standard deviation of a compared velocity.
     largest_sigma_m: float = Field(default=30.0, gt=0)  #: Largest standard deviation of a compared position.
-    #: Time for which a fall of C/N0 or gain, equal C/N0, or a distance from the map must persist to be a sign.
+    #: Time for which a fall of C/N0 or gain, equal C/N0, or a position off the map must persist to be a sign.
     hold_s: float = Field(default=3.0, gt=0)
-    part_hold_s: float = Field(default=10.0, gt=0)  #: Time for which a difference of constellations must persist.
-    #: Length of the window over which satellite and wheel distances are compared.
+    part_hold_s: float = Field(default=10.0, gt=0)  #: Time for which constellations must differ.
+    #: Length of the window over which GNSS and wheel distances are compared.
     wheel_window_s: float = Field(default=120.0, gt=0)
-    wheel_least_s: float = Field(default=60.0, gt=0)  #: Minimum length of a window that begins at a slip or gap.
-    wheel_m: float = Field(default=20.0, gt=0)  #: Minimum difference between satellite and wheel distance.
-    wheel_sigmas: float = Field(default=6.0, gt=0)  #: Minimum of this difference in standard deviations.
-    #: Whether the filter's protection level covers a pull of the positions along the track that the comparison with the
-    #: wheel has not detected yet. With "on", the level is two to four times as large.
+    wheel_least_s: float = Field(default=60.0, gt=0)  #: Minimum length of a window that begins at a slip or a data gap.
+    wheel_m: float = Field(default=20.0, gt=0)  #: Minimum difference between GNSS and wheel distance.
+    wheel_sigmas: float = Field(default=6.0, gt=0)  #: Minimum difference in standard deviations.
+    #: Whether the filter's protection level covers spoofing that slowly shifts the position along the track and that
+    #: the comparison with the wheel has not detected yet. With "on", the protection level is two to four times as
+    #: large.
     wheel_level: Literal["on", "off"] = "off"
-    #: Number of standard deviations of the distance difference that `wheel_level` adds to the level. The default of 2.1
-    #: assumes a probability of 1e-7 that a pull has begun within the window, and a risk of 1e-9.
+    #: With `wheel_level` on, the level is at least the distance difference plus this number of its standard deviations.
+    #: The default assumes a probability of 1e-7 that spoofing has begun within the window, and a risk of 1e-9.
     wheel_level_sigmas: float = Field(default=2.1, ge=0)
-    #: Relative standard deviation of the wheel circumference before it is estimated from positions.
+    #: Relative standard deviation of the wheel circumference before its estimation from positions.
     wheel_scale: float = Field(default=0.01, gt=0)
     #: Relative standard deviation of later changes of the wheel circumference (creep).
     wheel_change: float = Field(default=0.001, gt=0)
-    #: Wheel acceleration that counts as a slip, so that the comparison restarts. Adhesion allows 1 to 1.5 m/s^2.
+    #: Wheel acceleration above which a slip is assumed and the comparison restarts. Adhesion allows 1 to 1.5 m/s^2.
     wheel_acceleration_mps2: float = Field(default=1.6, gt=0)
-    #: Time for which a suspicion, other than suspected spoofing, remains after its last sign.
+    #: Time for which suspected jamming, a time-tag error or a position off the map remains after its last sign.
     jamming_release_s: float = Field(default=10.0, ge=0)
-    #: Time for which suspected spoofing remains after its last sign. A jump is visible at one epoch, but its cause
+    #: Time for which suspected spoofing remains after its last sign. A jump is visible at one epoch only, but its cause
     #: persists.
     spoofing_release_s: float = Field(default=300.0, ge=0)
 
 
 def cause_text(causes: Bits) -> Strings:
-    """Return the lower-case names of each epoch's signs joined by ``+``, same shape; empty without a sign."""
+    """Return the lower-case names of each epoch's signs, joined by ``+``; empty where there is no sign."""
     words, which = np.unique(causes, return_inverse=True)
     texts = ["+".join(str(cause.name).lower() for cause in CAUSES if cause & word) for word in words.tolist()]
     return np.array(texts, dtype=np.str_)[which.reshape(causes.shape)] if texts else np.zeros(causes.shape, "<U1")
 
 
 def suspicion(causes: Bits) -> Codes:
-    """Return the `Suspicion` of each epoch from its signs, same shape.
+    """Return the `Suspicion` of each epoch from its signs.
 
-    If several causes are possible, the cause that explains most signs is returned. A common time-tag error comes first,
-    because it displaces positions and clocks in the same way as a spoofer. Spoofing precedes leaving the map, because
-    leaving the map explains neither jumps nor equal C/N0 nor differing constellations. Satellites with individual
-    errors have already been excluded.
+    If several suspicions are possible, the first in a fixed order is returned. A time-tag error comes first, because it
+    displaces positions and clocks as a spoofer does. Spoofing precedes leaving the map, because leaving the map
+    explains neither jumps nor equal C/N0 nor differing constellations.
     """
     order = (
         (Sign.TIME_TAGS, Suspicion.TIME_TAGS), (_SPOOFING, Suspicion.SPOOFING_SUSPECTED),
@@ -172,26 +174,26 @@ _NEVER: Final = np.datetime64("NaT", "ns")
 
 @dataclass(frozen=True, kw_only=True)
 class HeldState:
-    """State of C conditions that have holding and release times, carried over from one chunk to the next."""
+    """State of C conditions with holding and release times after a chunk."""
 
     time: np.datetime64 = field(default_factory=lambda: _NEVER)  #: Time of the last epoch; NaT before the first.
-    #: Time for which each condition has been true, shape (C,).
+    #: Time for which each condition has been continuously true, shape (C,).
     run_ns: Integers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    #: Time at which each condition was last active; NaT for never; shape (C,).
+    #: Time at which each condition was last active, shape (C,); NaT if never.
     last: Datetimes = field(default_factory=lambda: np.zeros(0, dtype="datetime64[ns]"))
 
 
 def hold_signs(
     time: Datetimes, signs: Masks, state: HeldState, *, hold_s: Floats, release_s: Floats
 ) -> tuple[Masks, Masks, HeldState]:
-    """Apply holding and release times to conditions; return two masks and the state.
+    """Apply holding and release times to conditions; return two masks, shape (T, C), and the state.
 
-    The first mask marks conditions that have been true for their holding time, the second mask marks conditions that
-    are within their release time.
+    The first mask marks conditions that have been true for at least their holding time. The second mask also marks
+    conditions whose release time has not ended.
 
-    An interval between epochs counts for at most half the holding time, so that one epoch after a gap is not
-    sufficient. Signs and masks have the shape (T, C), holding and release times the shape (C,) [s]. A condition with a
-    holding time of 0 is active at once.
+    `signs` has the shape (T, C), holding and release times have the shape (C,) [s]. An interval between epochs counts
+    for at most half the holding time, so that one epoch after a gap is not sufficient. A condition with a holding time
+    of 0 is active at once.
     """
     conditions = signs.shape[1]
     run, last = state.run_ns, state.last
@@ -209,8 +211,8 @@ def hold_signs(
 
 _MINUTE_S: Final = 60.0
 _GAIN_DECAY_PER_MIN: Final = 0.005  #: Relative decay of the gain peak per minute.
-_LARGEST_DBHZ: Final = 100.0  #: Decay after which a peak is below every possible C/N0 [dB].
-_LONGEST_SILENCE_S: Final = 60.0  #: Longest absence of a satellite after which its earlier C/N0 is still used [s].
+_LARGEST_DBHZ: Final = 100.0  #: A peak that has decayed by this much is dropped [dB].
+_LONGEST_SILENCE_S: Final = 60.0  #: Longest gap within a satellite's tracking [s].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,21 +221,21 @@ class PowerState:
 
     #: Satellite and signal, such as "G011C"; shape (K,).
     channel: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U5"))
-    #: Peak of C/N0 plus the decay since the GPS epoch, shape (K,); -inf before the first observation.
+    #: C/N0 peak plus the decay from the GPS epoch to the peak, shape (K,); -inf before the first observation.
     peak_db: Floats = field(default_factory=lambda: np.zeros(0))
-    #: Time since the GPS epoch at which the current tracking of each channel began, shape (K,); NaN if never tracked.
+    #: Start of each channel's current tracking, in seconds since the GPS epoch, shape (K,); NaN if never tracked.
     first_s: Floats = field(default_factory=lambda: np.zeros(0))
-    #: Time since the GPS epoch at which each channel was last observed, shape (K,); NaN before the first observation.
+    #: Last observation of each channel, in seconds since the GPS epoch, shape (K,); NaN if never observed.
     last_s: Floats = field(default_factory=lambda: np.zeros(0))
-    gain: float = -np.inf  #: Peak of the natural logarithm of the gain, plus the decay since the GPS epoch.
+    gain: float = -np.inf  #: Peak of the logarithmic gain plus the decay from the GPS epoch to the peak.
 
 
 @dataclass(frozen=True, kw_only=True)
 class PowerSigns:
-    """C/N0 and gain statistics of T epochs; the C/N0 statistics are NaN where too few satellites are compared."""
+    """C/N0 and gain statistics of T epochs. The C/N0 statistics are NaN where too few satellites are available."""
 
     fall_db: Floats  #: Median, over the satellites, of the fall of C/N0 below the recent peak, shape (T,).
-    spread_db: Floats  #: Standard deviation of these falls, shape (T,).
+    spread_db: Floats  #: Standard deviation of the falls over the satellites, shape (T,).
     difference_db: Floats  #: Standard deviation of C/N0 over the satellites, shape (T,).
     #: Fall of the gain as a fraction of its recent peak, shape (T,); NaN where the receiver does not report the gain.
     gain_fall: Floats
@@ -244,10 +246,10 @@ def power_signs(
 ) -> tuple[PowerSigns, PowerState]:
     """Return the C/N0 and gain statistics of T epochs, and the state for the next chunk.
 
-    `cn0_dbhz` has the shape (T, K), with one signal per satellite at an epoch; `channel` names satellite and signal.
-    `gain`, shape (T,), is in any unit that increases with the gain; NaN where unknown. The recent peak of a satellite
-    decays by `peak_decay_db_per_min`, so that slow changes of elevation or obstruction do not raise an alarm, and a
-    constant jammer is detected for minutes.
+    `cn0_dbhz`, shape (T, K), has one signal per satellite at each epoch; `channel` names satellite and signal. `gain`,
+    shape (T,), increases with the front-end gain and may have any unit; NaN where unknown. A satellite's recent peak
+    decays by `peak_decay_db_per_min`, so that slow changes of elevation or obstruction are no sign, whereas a constant
+    jammer remains visible for minutes.
     """
     now, decay = seconds(time - GPS_EPOCH), limits.peak_decay_db_per_min / _MINUTE_S
     young = None if not len(time) else decay * (now[0] - state.last_s) < _LARGEST_DBHZ

@@ -1,4 +1,4 @@
-"""Signs of interference in clock, velocity and position: steps that are impossible for a train or an oscillator."""
+"""Detection of clock, velocity and position steps that are impossible for an oscillator or a train."""
 
 from __future__ import annotations
 
@@ -16,17 +16,16 @@ from railfix.integrity.interference.limits import InterferenceLimits
 from railfix.integrity.interference.range_fits import MotionInputs, clock_columns, fit_epochs, misfit_at
 from railfix.integrity.interference.time_tags import NO_TAGS, TagErrors, fit_time_tags, median_tag_error
 
-#: Step of the ranges when the receiver clock steps by 1 ms [m]; steps by whole milliseconds are no sign of
-#: interference.
+#: Step of the ranges when the receiver clock steps by 1 ms [m]. Receivers adjust their clocks by whole milliseconds.
 _MILLISECOND_M: Final = SPEED_OF_LIGHT * 1e-3
-#: Minimum redundancy for a noise estimate; fewer redundant ranges or Dopplers can agree by chance.
+#: Minimum number of redundant ranges or Dopplers of a fit. Fewer can agree by chance.
 _LEAST_FREEDOM: Final = 3
-_LEAST_MPS: Final = 0.05  #: Minimum noise of Dopplers [m/s].
-_SIZE: Final = 4  #: Number of unknowns of a fit to one constellation: position and clock.
+_LEAST_MPS: Final = 0.05  #: Minimum Doppler noise [m/s].
+_SIZE: Final = 4  #: Number of unknowns of a single-constellation fit: position and clock.
 
 
 class Fix(NamedTuple):
-    """Positions and velocities of T epochs with their 3-D standard deviations; NaN where missing."""
+    """Positions and velocities of T epochs with 3-D standard deviations; NaN where missing."""
 
     time: Datetimes
     ecef_m: Floats  # (T, 3)
@@ -59,41 +58,41 @@ class MotionSignState:
     rate_mps: Floats = field(default_factory=lambda: np.zeros(0))
     #: Time of the last code and range rate of each channel, shape (K,).
     since: Datetimes = field(default_factory=lambda: np.zeros(0, dtype="datetime64[ns]"))
-    position: Fix = field(default_factory=_no_fix)  #: Last epoch whose position is accurate enough for a comparison.
-    velocity: Fix = field(default_factory=_no_fix)  #: Last epoch whose velocity is accurate enough for a comparison.
+    position: Fix = field(default_factory=_no_fix)  #: Last position that is accurate enough for a comparison.
+    velocity: Fix = field(default_factory=_no_fix)  #: Last velocity that is accurate enough for a comparison.
     on_map: bool = False  #: True once a position has been on the map.
-    tags: TagErrors = NO_TAGS  #: Time-tag errors fitted at the last epochs.
+    tags: TagErrors = NO_TAGS  #: Time-tag errors of the last epochs.
 
 
 @dataclass(frozen=True, kw_only=True)
 class MotionSigns:
     """Motion statistics of T epochs; NaN where a comparison is not possible."""
 
-    clock_jump_m: Floats  #: Median change of codes relative to Dopplers, minus whole milliseconds; shape (T,).
-    #: Parts of the changes of clock drift, velocity and position that an oscillator or a train cannot cause, each in
-    #: physical units and in standard deviations; shape (T,).
+    clock_jump_m: Floats  #: Median change of codes relative to Dopplers, without whole milliseconds; shape (T,).
+    #: Jumps of clock drift, velocity and position, shape (T,). A jump is the part of a change that exceeds the limits
+    #: of an oscillator or a train. Each jump is also expressed in standard deviations.
     drift_jump_mps: Floats
     drift_jump_sigmas: Floats
     speed_jump_mps: Floats
     speed_jump_sigmas: Floats
     position_jump_m: Floats
     position_jump_sigmas: Floats
-    #: Largest difference between the positions and clocks of any two constellations, in standard deviations; (T,).
+    #: Largest normalised difference between the positions and clocks of two constellations, shape (T,).
     part_sigmas: Floats
-    off_line_m: Floats  #: Distance of the 3-D position from the line, shape (T,); NaN before the first position on it.
-    #: Excess of `off_line_m` over `InterferenceLimits.position_jump_m` in standard deviations, shape (T,).
+    off_line_m: Floats  #: Distance of the 3-D position from the line, shape (T,); NaN until a position is on it.
+    #: Excess of `off_line_m` over `InterferenceLimits.position_jump_m`, in standard deviations; shape (T,).
     off_line_sigmas: Floats
-    tag_error_s: Floats  #: Median time-tag error of the last epochs, positive for late tags; shape (T,).
+    tag_error_s: Floats  #: Median time-tag error of the last epochs, positive for late time tags; shape (T,).
     tag_error_sigmas: Floats  #: Absolute value of `tag_error_s` in standard deviations, shape (T,).
 
 
 class MotionFit(NamedTuple):
-    """Single-epoch fits to the ranges of one or several antennas, T epochs."""
+    """Single-epoch fits at T epochs of one or several antennas."""
 
     fixes: Fix
-    part_sigmas: Floats  #: As in `MotionSigns`.
-    tag_error_s: Floats  #: Time-tag error, positive for late tags, shape (T,); NaN without redundancy.
-    tag_sigma_s: Floats  #: Standard deviation of the time-tag error, shape (T,); NaN without redundancy.
+    part_sigmas: Floats  #: As `MotionSigns.part_sigmas`.
+    tag_error_s: Floats  #: Time-tag error, positive for late time tags, shape (T,); NaN if not redundant.
+    tag_sigma_s: Floats  #: Standard deviation of the time-tag error, shape (T,); NaN if not redundant.
 
     def take(self, rows: slice) -> MotionFit:
         """Return the fits of selected epochs."""
@@ -101,7 +100,7 @@ class MotionFit(NamedTuple):
 
 
 def fit_motion(inputs: MotionInputs, limits: InterferenceLimits) -> MotionFit:
-    """Fit positions, velocities, constellation differences and time-tag errors to the ranges of each epoch."""
+    """Estimate position, velocity, constellation difference and time-tag error of each epoch."""
     linear = misfit_at(inputs)
     parts = _parts(inputs, linear, limits.least_satellites - 1)
     return MotionFit(fit_motion_fixes(inputs, linear), parts, *fit_time_tags(inputs))
@@ -110,9 +109,9 @@ def fit_motion(inputs: MotionInputs, limits: InterferenceLimits) -> MotionFit:
 def motion_signs(
     inputs: MotionInputs, state: MotionSignState, limits: InterferenceLimits, fitted: MotionFit | None = None
 ) -> tuple[MotionSigns, MotionSignState]:
-    """Return the clock, velocity and position statistics of T epochs, and the state for the next chunk.
+    """Compute clock, velocity and position statistics of T epochs; return them and the state for the next chunk.
 
-    `fitted` is the result of `fit_motion` for the same inputs; by default, it is computed here.
+    `fitted` is the result of `fit_motion` for the same inputs. By default, the function computes it.
     """
     if not len(inputs.time):
         return MotionSigns(**{item.name: np.zeros(0) for item in fields(MotionSigns)}), state
@@ -164,12 +163,12 @@ def fit_motion_fixes(inputs: MotionInputs, linear: tuple[Floats, Floats, Floats]
 
 
 def _length(covariance: Floats) -> Floats:
-    """Return the 3-D standard deviation, the square root of the sum of the first three variances, shape (T,)."""
+    """Return the 3-D standard deviation, shape (T,), from the variances of the first three unknowns."""
     return np.asarray(np.sqrt(covariance[:, :3, :3].trace(axis1=1, axis2=2)))
 
 
 def _before(fixes: Fix, start: Fix, good: Masks) -> tuple[Fix, Fix]:
-    """Return the last accurate fix before each epoch, and the last of the chunk; `start` where there is none."""
+    """Return the last `good` fix before each epoch, and the last `good` fix of the chunk; by default `start`."""
     if len(good) == 1:
         return start, fixes if good[0] else start
     time, *numbers = (np.concatenate([a, b]) for a, b in zip(start, fixes, strict=True))
@@ -180,7 +179,7 @@ def _before(fixes: Fix, start: Fix, good: Masks) -> tuple[Fix, Fix]:
 
 
 def _speed_jump(now: Fix, before: Fix, limits: InterferenceLimits) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return the changes of velocity and clock drift beyond the physical limits, in m/s and in sigmas, (T,)."""
+    """Return the jumps of velocity and clock drift, each in m/s and in standard deviations, shape (T,)."""
     dt = seconds(now.time - before.time)
     near = np.where(dt <= limits.longest_gap_s, 1.0, np.nan)
     sigma = np.hypot(now.velocity_sigma_mps, before.velocity_sigma_mps)
@@ -193,10 +192,10 @@ def _speed_jump(now: Fix, before: Fix, limits: InterferenceLimits) -> tuple[Floa
 
 
 def _position_jump(now: Fix, before: Fix, moving: Fix, limits: InterferenceLimits) -> tuple[Floats, Floats]:
-    """Return the distance by which a position is out of reach from the previous position, in m and in sigmas, (T,).
+    """Return the position jump in metres and in standard deviations, shape (T,).
 
-    The previous position is extrapolated with the velocity at that position. Without a velocity, the train may have
-    moved in any direction at the largest speed of a train.
+    The jump is measured from the previous position, extrapolated with the previous velocity. If the previous velocity
+    is unknown, a train may have moved in any direction at its largest speed.
     """
     dt = seconds(now.time - before.time)
     velocity = np.where((moving.time == before.time)[:, None], moving.velocity_mps[:, :3], np.nan)
@@ -212,7 +211,7 @@ def _position_jump(now: Fix, before: Fix, moving: Fix, limits: InterferenceLimit
 def _clock_jump(
     inputs: MotionInputs, state: MotionSignState, limits: InterferenceLimits
 ) -> tuple[Floats, tuple[Strings, Floats, Floats, Datetimes]]:
-    """Return the median change of codes relative to Dopplers (T,) [m], whole milliseconds removed, and last codes."""
+    """Return `MotionSigns.clock_jump_m`, and each channel's name, last code, last range rate and their time."""
     young = seconds(inputs.time[0] - state.since) <= limits.longest_gap_s
     joined = join_channels(inputs.channel, [state.channel], [young])
     code, rate = (joined.arrange(values, np.nan) for values in (state.code_m, state.rate_mps))
@@ -227,7 +226,7 @@ def _clock_jump(
 
 
 def _parts(inputs: MotionInputs, linear: tuple[Floats, Floats, Floats], least: int) -> Floats:
-    """Return the largest position and clock difference between two constellations, in standard deviations, (T,)."""
+    """Return the largest normalised position and clock difference between two constellations, shape (T,)."""
     near, sight, misfit = linear
     design = np.concatenate([-sight, np.ones((*sight.shape[:2], 1))], axis=2)
     epochs, clocks = len(near), int(inputs.group.max(initial=-1)) + 1

@@ -1,4 +1,4 @@
-"""Input ranges of the interference tests, and least-squares fits of the ranges."""
+"""Ranges used by the interference tests, and least-squares fits to these ranges."""
 
 from __future__ import annotations
 
@@ -11,31 +11,31 @@ from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.positioning.search_index import SearchIndex
 
 _TURN: Final = EARTH_ROTATION_RATE / SPEED_OF_LIGHT
-_RIDGE: Final = 1e-9  #: Loose prior weight of the unknowns, for conditioning.
+_RIDGE: Final = 1e-9  #: Weight of a loose prior on the unknowns, for conditioning.
 
 
 class MotionInputs(NamedTuple):
-    """Ranges of T epochs by K channels, and the lines of the antennas."""
+    """Ranges of K channels at T epochs, and the lines of the antennas."""
 
     time: Datetimes  #: Shape (T,).
     break_before: Masks  #: True where an epoch is not compared with the previous epoch, shape (T,).
     channel: Strings  #: Satellite and signal, shape (K,).
-    group: Indices  #: Receiver clock of each channel, shape (K,).
-    near_ecef_m: Floats  #: Approximate position, accurate to some kilometres, shape (T, 3); NaN if unknown.
+    group: Indices  #: Index of each channel's receiver clock, shape (K,).
+    near_ecef_m: Floats  #: Approximate position with errors up to some kilometres, shape (T, 3); NaN if unknown.
     sat_ecef_m: Floats  #: Satellite positions, shape (T, K, 3).
     sat_velocity_mps: Floats  #: Satellite velocities, shape (T, K, 3).
     code_m: Floats  #: Observed pseudoranges, shape (T, K).
-    rate_mps: Floats  #: Range rates from Dopplers, ``-lambda D``, shape (T, K).
+    rate_mps: Floats  #: Range rates from Dopplers (``-lambda D``), shape (T, K).
     corrected_code_m: Floats  #: Corrected pseudoranges, shape (T, K).
     sigma_m: Floats  #: Standard deviations of the corrected pseudoranges, shape (T, K).
     used: Masks  #: Channels without a rejection reason, shape (T, K).
-    named: Masks  #: Channels rejected only for an error of their own satellite, shape (T, K).
+    named: Masks  #: Channels rejected only because their own satellite is faulty, shape (T, K).
     noise_scale: Floats  #: Ratio of the receiver's range standard deviation to `sigma_m`, shape (T,).
-    clock_offset_m: Floats  #: Known offsets between the receiver clocks, shape (T, G).
-    clock_sigma_m: Floats  #: Standard deviations of these offsets, shape (T, G).
+    clock_offset_m: Floats  #: Known offsets of the receiver clocks, shape (T, G).
+    clock_sigma_m: Floats  #: Standard deviations of the clock offsets, shape (T, G).
     #: Lateral distance of the 3-D position from the line, shape (T,); NaN beyond an end of the line.
     off_line_m: Floats
-    #: True where codes have gross errors or are rejected as faulty, or the position failed a check, shape (T,).
+    #: True where codes are faulty or the position failed a check, shape (T,).
     doubted: Masks
     antenna: Indices  #: Index of each epoch's antenna in `lines`, shape (T,).
     lines: tuple[SearchIndex, ...]  #: Line of each antenna.
@@ -48,7 +48,7 @@ class MotionInputs(NamedTuple):
         return MotionInputs(**own)
 
     def nearest_on_lines(self) -> tuple[Floats, Floats]:
-        """Return the line vertices nearest to `near_ecef_m`, (T, 3), and the axes across and up at them, (T, 2, 3)."""
+        """Return the line vertices nearest to `near_ecef_m`, (T, 3), and their lateral and vertical axes, (T, 2, 3)."""
         point, axes = np.full(self.near_ecef_m.shape, np.nan), np.full((len(self.time), 2, 3), np.nan)
         for number, line in enumerate(self.lines):
             rows = np.flatnonzero((self.antenna == number) & np.isfinite(self.near_ecef_m[:, 0]))
@@ -64,7 +64,7 @@ def clock_columns(inputs: MotionInputs) -> Floats:
 
 
 def misfit_at(inputs: MotionInputs) -> tuple[Floats, Floats, Floats]:
-    """Return approximate positions (T, 3), unit vectors to satellites (T, K, 3) and codes minus ranges (T, K)."""
+    """Return approximate positions (T, 3), unit vectors to satellites (T, K, 3) and codes minus distances (T, K)."""
     near = inputs.near_ecef_m
     to_satellite = inputs.sat_ecef_m - near[:, None, :]
     distance = np.linalg.norm(to_satellite, axis=2)
@@ -73,7 +73,7 @@ def misfit_at(inputs: MotionInputs) -> tuple[Floats, Floats, Floats]:
 
 
 def fit_epochs(design: Floats, value: Floats, weight: Floats, *, least: int) -> tuple[Floats, Floats, Floats]:
-    """Return solutions, covariances and noise scales of weighted least squares, epoch by epoch.
+    """Return weighted least-squares solutions, covariances and noise scales of single epochs.
 
     Solutions and noise scales are NaN where the redundancy is below `least`, or where the position is undetermined.
     """

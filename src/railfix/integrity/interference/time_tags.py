@@ -1,8 +1,8 @@
-"""Test for a common time-tag error, which is fitted together with position and receiver clocks.
+"""Test for a common time-tag error, estimated together with position and receiver clocks.
 
-With wrong time tags, satellite positions are computed for the wrong time; the design column of the time-tag error is
-therefore the negative range rate. The alternative hypotheses are bad codes and a train off its map. A time-tag error is
-accepted only if it explains the residuals clearly better than the alternatives.
+With wrong time tags, satellite positions are computed for the wrong time. The design column of the time-tag error is
+therefore the negative range rate. The alternative hypotheses are faulty codes and a train that is off its map. A
+time-tag error is accepted only if it explains the residuals clearly better than both alternatives.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.constants import EARTH_ROTATION_RATE, GM_GPS
 from railfix.integrity.interference.range_fits import MotionInputs, clock_columns, fit_epochs, misfit_at
 
-#: Order of magnitude of a satellite's range rate, by which the design column of the time-tag error is divided [m/s].
+#: Scale of the design column of the time-tag error: order of magnitude of a satellite's range rate [m/s].
 _RATE_MPS: Final = 500.0
-_TAG_EPOCHS: Final = 10  #: Largest number of epochs over which the median error is computed.
-_TAG_LEAST: Final = 3  #: Smallest number of epochs over which the median error is computed.
-_TAG_WINDOW: Final = np.timedelta64(60, "s")  #: Largest age of an epoch in the median error.
-_STEPS: Final = 6  #: Largest number of steps of a fit.
-_SETTLED_S: Final = 0.05  #: Largest change of the time-tag error in the last step of a fit [s].
-_SETTLED_M: Final = 100.0  #: Largest change of the position in the last step of a fit [m].
-_ROUNDS: Final = 2  #: Number of reweighted fits per step.
-_FITS_WELL: Final = 3.0  #: Multiple of the median residual up to which residuals have full weight.
-_SHOWN: Final = 3.0  #: Time-tag errors above this many standard deviations are compared with the alternatives.
-_NEAR_LINE_M: Final = 20.0  #: Standard deviation of a train's distance from its line, across and up.
-_LEAST_FREEDOM: Final = 3  #: Minimum number of redundant ranges that agree with a time-tag error.
-#: Residuals up to this many standard deviations count as consistent. In the cost, residuals are clipped at this limit.
+_TAG_EPOCHS: Final = 10  #: Largest number of epochs in the median time-tag error.
+_TAG_LEAST: Final = 3  #: Smallest number of epochs in the median time-tag error.
+_TAG_WINDOW: Final = np.timedelta64(60, "s")  #: Largest age of an epoch in the median time-tag error.
+_STEPS: Final = 6  #: Largest number of iterations of a fit.
+_SETTLED_S: Final = 0.05  #: Change of the time-tag error below which the iteration ends [s].
+_SETTLED_M: Final = 100.0  #: Change of the position below which the iteration ends [m].
+_ROUNDS: Final = 2  #: Number of reweighted fits per iteration.
+_FITS_WELL: Final = 3.0  #: Residuals up to this multiple of their median have full weight.
+_SHOWN: Final = 3.0  #: Time-tag errors above this many standard deviations are fitted again with the line.
+_NEAR_LINE_M: Final = 20.0  #: Standard deviation of the line constraint, lateral and vertical [m].
+_LEAST_FREEDOM: Final = 3  #: Minimum redundancy of the rows that agree with a time-tag error.
+#: Residuals below this many standard deviations agree with a fit. The cost function clips residuals at this limit.
 _AGREES: Final = 5.0
-#: Minimum reduction of the cost by an accepted time-tag error. The value exceeds the cost of one clipped residual,
-#: because a time-tag error can absorb one bad code.
+#: Minimum reduction of the cost by an accepted time-tag error. It exceeds the cost of one clipped residual (25),
+#: because a time-tag error can absorb one faulty code.
 _CLEARLY_LESS: Final = 36.0
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.
 _ACROSS_AXIS: Final = np.array([1.0, 1.0, 0.0])
@@ -50,7 +50,7 @@ NO_TAGS: Final = TagErrors(np.zeros(0, dtype="datetime64[ns]"), np.zeros(0), np.
 
 
 class _TagFit(NamedTuple):
-    """Positions fitted with a time-tag error, T epochs."""
+    """Positions and time-tag errors fitted at T epochs."""
 
     error_s: Floats  # (T,), positive for late tags
     sigma_s: Floats  # (T,)
@@ -59,13 +59,13 @@ class _TagFit(NamedTuple):
 
 
 def fit_time_tags(inputs: MotionInputs) -> tuple[Floats, Floats]:
-    """Return the common time-tag error, positive for late tags, and its standard deviation, shape (T,) [s].
+    """Return the common time-tag error, positive for late time tags, and its standard deviation, shape (T,) [s].
 
-    The fit includes satellites rejected as faulty, because a time-tag error makes satellites appear faulty. Where the
-    error is significant, or the position is doubtful, the line is used as a constraint. The standard deviation is then
-    infinite unless enough redundant rows agree and the cost is clearly lower than the cost of a fit without a time-tag
-    error and without the rejected satellites. The cost is the sum of the squared normalised residuals of all codes and
-    of the line, clipped at `_AGREES`. Both values are NaN where they cannot be determined.
+    The fit includes satellites that were rejected as faulty, because a time-tag error makes satellites appear faulty.
+    Where the time-tag error is significant or the position is doubtful, the fit is repeated with the line as a
+    constraint and compared with a fit without a time-tag error and without the rejected satellites. If the time-tag
+    error does not explain the residuals clearly better, its standard deviation is infinite. Both values are NaN where
+    they cannot be determined.
     """
     near, every = inputs.near_ecef_m, inputs.used | inputs.named
     error, sigma, place, _ = _fit(inputs, every, np.zeros(len(near)), near, tags=True, line=False)
@@ -80,12 +80,15 @@ def fit_time_tags(inputs: MotionInputs) -> tuple[Floats, Floats]:
 
 
 def _explains_more(inputs: MotionInputs, with_error: Floats, without: Floats) -> Masks:
-    """Return whether a time-tag error explains the residuals clearly better than bad codes, shape (T,)."""
+    """Return True where a time-tag error explains the residuals clearly better than faulty codes, shape (T,).
+
+    The cost compared is the sum of squared normalised residuals of codes and line, each clipped at `_AGREES`.
+    """
     every = inputs.used | inputs.named
     rows, clocks = _with_line(every, True), (clock_columns(inputs) * every[..., None]).any(axis=1).sum(axis=1)
-    # without a redundant range, the accepted ranges fit exactly, and the rejected ranges count as wrong
+    # without redundancy, the accepted ranges fit exactly, and the rejected ranges count as faulty
     without = np.where(np.isnan(without), np.where(_with_line(inputs.named, False), np.inf, 0.0), without)
-    # noise scale of the fit with a time-tag error, limited to the noise scale of the receiver, but at least 1
+    # noise scale of the fit with a time-tag error, at most that of the receiver and at least 1
     noise = np.maximum(np.minimum(masked_median(with_error, rows) / _NORMAL_MEDIAN, inputs.noise_scale), 1.0)[:, None]
     before, after = (np.minimum(np.where(rows, each / noise, 0.0), _AGREES) ** 2 for each in (without, with_error))
     freedom = (rows & (after < _AGREES**2)).sum(axis=1) - 4 - clocks
@@ -95,7 +98,7 @@ def _explains_more(inputs: MotionInputs, with_error: Floats, without: Floats) ->
 def _fit(
     inputs: MotionInputs, counted: Masks, late_s: Floats, place_ecef_m: Floats, *, tags: bool, line: bool
 ) -> _TagFit:
-    """Fit positions to the `counted` codes (T, K), with a time-tag error if `tags`, and near the line if `line`."""
+    """Fit positions to `counted` codes (T, K); estimate a time-tag error if `tags`; constrain to the line if `line`."""
     rows, late, place = np.arange(len(late_s)), late_s.copy(), place_ecef_m.copy()
     sigma, residual = np.full(len(rows), np.nan), np.full((len(rows), counted.shape[1] + 2), np.nan)
     for _ in range(_STEPS):
@@ -121,14 +124,14 @@ def _fit(
 
 
 def _with_line(channels: Masks, line: bool) -> Masks:
-    """Append the two rows of the line constraint to a mask of channels (T, K); shape (T, K + 2)."""
+    """Append two columns for the line constraint to a channel mask (T, K); return a mask of shape (T, K + 2)."""
     return np.concatenate([channels, np.full((len(channels), 2), line)], axis=1)
 
 
 def _fit_robustly(design: Floats, value: Floats, weight: Floats, counted: Masks) -> tuple[Floats, Floats, Floats]:
-    """Return solutions, standard deviations of the fourth unknown, and absolute residuals in standard deviations.
+    """Return solutions, standard deviations of the time-tag error, and absolute normalised residuals.
 
-    The `counted` rows are fitted, with lower weights for large residuals. For other rows, only residuals are computed.
+    Only `counted` rows are fitted, and large residuals have lower weights. Residuals are returned for all rows.
     """
     now = full = np.where(counted, weight, 0.0)
     for _ in range(_ROUNDS):
@@ -152,10 +155,10 @@ def _move_satellites(inputs: MotionInputs, late_s: Floats) -> MotionInputs:
 
 
 def median_tag_error(now: TagErrors, before: TagErrors) -> tuple[Floats, Floats, TagErrors]:
-    """Return the median of the last time-tag errors, its absolute value in standard deviations, and the last errors.
+    """Return the median time-tag error, its absolute value in standard deviations, and the errors of the last epochs.
 
-    The standard deviation is the larger of two values: the median of the epochs' standard deviations, and the robust
-    spread of the time-tag errors. The results are NaN for fewer than `_TAG_LEAST` epochs.
+    The standard deviation is the larger of the median of the single epochs' standard deviations and the robust spread
+    of the time-tag errors. The median is NaN for fewer than `_TAG_LEAST` epochs.
     """
     tags = TagErrors._make(np.concatenate([a, b]) for a, b in zip(before, now, strict=True))
     lead = TagErrors(np.full(_TAG_EPOCHS - 1, np.datetime64("NaT", "ns")), *np.full((2, _TAG_EPOCHS - 1), np.nan))

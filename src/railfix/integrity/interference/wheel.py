@@ -1,8 +1,11 @@
-"""Comparison of satellite and wheel distances, which detects a slow pull of the positions along the track.
+"""Detection of slow spoofing along the track from GNSS and wheel distances.
 
-Over a window, the two distances differ by the noise of two positions, and by the wheel scale-factor error, which is
-estimated from the data before the window. A pull that exists from the start of the run, or is within the uncertainty of
-the wheel diameter, is not detected.
+The GNSS distance is the difference between two GNSS positions along the line. Slow spoofing pulls the position away
+from the true position, so that the GNSS distance deviates from the wheel distance.
+
+Without spoofing, the two distances over a window differ by the noise of two positions and by the wheel scale-factor
+error, which is estimated from the data before the window. Spoofing that begins with the run, or that stays within the
+uncertainty of the wheel scale factor, is not detected.
 """
 
 from __future__ import annotations
@@ -16,58 +19,58 @@ from railfix.core.arrays import Datetimes, Floats, Integers, Masks, RowArrays, j
 from railfix.core.timescale import GPS_EPOCH, seconds, timedelta
 from railfix.integrity.interference.limits import HeldState, InterferenceLimits, hold_signs
 
-#: Standard deviation of satellite and atmospheric errors that change over minutes [m]; added to that of positions.
+#: Standard deviation of satellite and atmospheric errors that change over minutes [m].
 _LEAST_M: Final = 1.0
-#: Largest speed at which a tachometer may have no output [m/s].
+#: Speed below which a tachometer may have no output [m/s].
 _SLOW_MPS: Final = 0.5
-#: `_SECOND`: interval of the positions used. `_TAG`: largest time by which a tag may precede the whole second.
+#: Interval between compared positions, and largest time by which a time tag may precede the whole second.
 _SECOND, _TAG = np.timedelta64(1, "s"), np.timedelta64(5, "ms")
 
 
 @dataclass(frozen=True, kw_only=True)
 class WheelSamples(RowArrays):
-    """Satellite positions and wheel distances, at most once per second, shape (N,)."""
+    """GNSS positions and wheel distances, at most one pair per second, shape (N,)."""
 
     time: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))
-    arc_m: Floats = field(default_factory=lambda: np.empty(0))  #: Satellite position along the line.
-    sigma_m: Floats = field(default_factory=lambda: np.empty(0))  #: Standard deviation of the satellite position.
+    arc_m: Floats = field(default_factory=lambda: np.empty(0))  #: GNSS position along the line.
+    sigma_m: Floats = field(default_factory=lambda: np.empty(0))  #: Standard deviation of the GNSS position.
     distance_m: Floats = field(default_factory=lambda: np.empty(0))  #: Wheel distance since the start of the run.
-    #: Largest distance since the start that may be missing in `distance_m`, because the tachometer has no output at low
-    #: speed.
+    #: Largest part of the distance since the start that `distance_m` may lack, because tachometers have no output at
+    #: low speed.
     doubt_m: Floats = field(default_factory=lambda: np.empty(0))
-    #: Number of the part of the run; within a part, there is neither slip nor a gap in the wheel data.
+    #: Number of the part of the run. Within a part, the wheel data have neither slip nor a gap.
     part: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
 
 @dataclass(frozen=True, kw_only=True)
 class WheelState:
-    """State of the comparison of satellite and wheel distances, carried over from one chunk to the next."""
+    """State of the comparison after a chunk."""
 
     #: First sample of the current part, and the samples of the last window.
     samples: WheelSamples = field(default_factory=WheelSamples)
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Time of the last epoch.
     distance_m: float = 0.0  #: `WheelSamples.distance_m` at the last epoch.
     doubt_m: float = 0.0  #: `WheelSamples.doubt_m` at the last epoch.
-    speed_mps: float = float("nan")  #: Last known wheel speed; NaN before the first.
+    speed_mps: float = float("nan")  #: Last known wheel speed; NaN if none.
     part: int = 0  #: Number of the current part.
     second: int = -1  #: GPS second of the last epoch.
     held: HeldState = field(default_factory=HeldState)
     difference_m: float = float("nan")  #: `WheelSigns.difference_m` at the last sample.
     bound_m: float = float("nan")  #: `WheelSigns.bound_m` at the last sample.
-    beyond: bool = False  #: Whether the difference exceeds its limits at the last sample.
+    beyond: bool = False  #: True if the difference exceeds its limits at the last sample.
 
 
 @dataclass(frozen=True, kw_only=True)
 class WheelSigns:
-    """Differences between satellite and wheel distances at T epochs."""
+    """Differences between GNSS and wheel distances at T epochs."""
 
-    #: Satellite distance minus scaled wheel distance over the window, shape (T,); NaN where not compared.
+    #: GNSS distance minus scaled wheel distance over the window, shape (T,); NaN where not compared.
     difference_m: Floats
-    #: Bound of the position error for a pull that began within the window, shape (T,). The bound is the absolute
-    #: difference plus `wheel_level_sigmas` times the sigma of the start position and of the wheel distance since then.
-    #: Windows shorter than `wheel_least_s` also have a bound.
+    #: Bound of the position error caused by spoofing that began within the window, shape (T,). The bound is the
+    #: absolute difference plus `wheel_level_sigmas` standard deviations. This standard deviation combines the position
+    #: at the window start with the wheel distance. Windows shorter than `wheel_least_s` also have a bound.
     bound_m: Floats
-    #: True where the difference exceeds noise and diameter error, or exceeded them within the release time; shape (T,).
+    #: True where the difference exceeds its limits, or exceeded them within the release time; shape (T,).
     parted: Masks
 
 
@@ -81,11 +84,11 @@ def wheel_signs(
     *,
     signed: bool,
 ) -> tuple[WheelSigns, WheelState]:
-    """Compare satellite and wheel distances of T epochs, and return the signs and the state for the next chunk.
+    """Compare GNSS and wheel distances at T epochs; return the signs and the state for the next chunk.
 
-    `arc_m` and `sigma_m` are single-epoch or filtered positions along the line and their standard deviations, NaN if
-    missing. `wheel_m` is the wheel distance since the previous epoch, NaN if unknown. `signed` is True if the wheel
-    distance has the sign of the motion along the line. The arrays have the shape (T,).
+    `arc_m` are single-epoch or filtered positions along the line, `sigma_m` their standard deviations, and `wheel_m`
+    the wheel distances since the previous epoch. All have the shape (T,), with NaN where unknown. `signed` is True if
+    the sign of the wheel distance is the direction of motion along the line.
     """
     if not len(time):
         return WheelSigns(difference_m=np.empty(0), bound_m=np.empty(0), parted=np.empty(0, dtype=np.bool_)), state
@@ -116,7 +119,7 @@ def wheel_signs(
 def _wheel_distances(
     time: Datetimes, wheel_m: Floats, state: WheelState, limits: InterferenceLimits
 ) -> tuple[WheelSamples, WheelState]:
-    """Accumulate the wheel distance; a new part begins after a slip, a long interval or an unknown distance."""
+    """Accumulate the wheel distance. A new part begins after a slip, a long interval or an unknown distance."""
     span = seconds(np.diff(np.concatenate([[time[0] if np.isnat(state.time) else state.time], time])))
     known = np.isfinite(wheel_m) & (span > 0.0)
     speed = np.where(known, wheel_m / np.where(span > 0.0, span, 1.0), np.nan)
@@ -139,21 +142,22 @@ def _wheel_distances(
 def _compare(
     samples: WheelSamples, first: int, limits: InterferenceLimits, *, signed: bool
 ) -> tuple[Floats, Floats, Masks]:
-    """Compare satellite and wheel distances over the window before each sample, from sample `first` on.
+    """Compare GNSS and wheel distances over the window before each sample, beginning with sample `first`.
 
-    Return differences, bounds, and the mask of differences that exceed their limits.
+    Return differences, bounds, and a mask of differences that exceed their limits. The wheel distance is corrected by
+    the scale factor estimated from the data before each window.
 
-    The wheel scale factor, estimated from the part before each window, is applied to the wheel distance.
+
     """
     time = seconds(samples.time - samples.time[0]) if len(samples.time) else np.empty(0)
     now = np.arange(first, len(time))
     begun = np.searchsorted(time, time[now] - limits.wheel_window_s - 0.5)
-    start = np.searchsorted(samples.part, samples.part[now])  # part numbers never decrease
+    start = np.searchsorted(samples.part, samples.part[now])  # part numbers are sorted
     begun = np.maximum(begun, start)
     long_enough = time[now] - time[begun] >= limits.wheel_least_s - 0.5
 
     def apart(a: Integers, b: Integers) -> tuple[Floats, Floats, Floats]:
-        """Return satellite minus wheel distance, wheel distance, and the variance of the difference except for `b`."""
+        """Return GNSS minus wheel distance, wheel distance, and the variance of the former without `sigma_m[b]`."""
         arc, distance = samples.arc_m[b] - samples.arc_m[a], samples.distance_m[b] - samples.distance_m[a]
         if not signed:
             arc, distance = np.abs(arc), np.abs(distance)

@@ -1,6 +1,6 @@
-"""Protection level along the track (P1 2.4): a bound that the position error exceeds with at most the stated risk.
+"""Protection level along the track (P1 2.4): a bound on the position error for a stated risk.
 
-Levels are computed from a model of `railfix.integrity.raim`::
+Protection levels are computed from a `railfix.integrity.raim.LinearModel`::
 
     risk = RiskBudget()
     model = linear_model(ranges, trajectory, arc_m)

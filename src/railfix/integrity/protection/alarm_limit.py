@@ -1,4 +1,4 @@
-"""Availability of protection levels within an alarm limit."""
+"""Availability: comparison of protection levels with an alarm limit."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ from railfix.integrity.protection.solution_separation import LevelStatus
 
 
 def availability(level_m: ArrayLike, alarm_limit_m: float, *, consistent: ArrayLike = True) -> Codes:
-    """Return the `LevelStatus` of each epoch from its level [m] and the alarm limit (P1 2.4), as int8, same shape.
+    """Return the `LevelStatus` of each protection level for an alarm limit (P1 2.4), int8, shape of `level_m`.
 
-    A level of NaN means that there is no position. `consistent` states whether the ranges of each epoch are consistent
-    (`ProtectionLevel.consistent`); epochs with a position and inconsistent ranges are ALARM. Raise ValueError if the
-    alarm limit is not positive.
+    `level_m` is NaN for epochs without a position. `consistent` is `ProtectionLevel.consistent`. The status is ALARM
+    for epochs with a position and inconsistent ranges. Raise ValueError if the alarm limit is not positive.
     """
     if not alarm_limit_m > 0.0:
         raise ValueError(f"alarm_limit_m must be positive, got {alarm_limit_m}")

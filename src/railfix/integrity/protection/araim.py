@@ -1,17 +1,16 @@
 """ARAIM: multiple-hypothesis solution separation with an integrity support message, along the track and in 3-D.
 
-The algorithm was published by the EU-U.S. Working Group C (milestone 3 report, annex A; ADD 3.0). For each fault mode
-k, the position is computed without the satellites of the mode, by `S_k = (G' W_k G)^-1 G' W_k` with the weights W of
-the integrity sigmas. For the component q of the position,
+The EU-U.S. Working Group C published the algorithm (milestone 3 report, annex A; ADD 3.0). For each fault mode k, the
+position is computed without the satellites of the mode. The gain matrix is `S_k = (G' W_k G)^-1 G' W_k`, with weights W
+from the integrity sigmas. For the position component q,
 
-- the variance is `sigma_k^2 = [(G' W_k G)^-1]_qq`, and the bias `b_k = sum_i |S_k,qi| b_i`;
+- the variance is `sigma_k^2 = [(G' W_k G)^-1]_qq`, and the bias is `b_k = sum_i |S_k,qi| b_i`;
 - the threshold is `T_k = K_fa sqrt(sum_i (S_k,qi - S_0,qi)^2 sigma_acc,i^2)` with the accuracy sigmas;
 - the level L satisfies
   `2 Q((L - b_0) / sigma_0) + sum_k p_k Q((L - T_k - b_k) / sigma_k) = PHMI_q (1 - P_unmonitored / PHMI)`.
 
-A map is an additional constraint (Wenz 2024). This constraint consists of two observations, the offsets across and up,
-with the sigmas of the map. Both observations are faulty together if the map is wrong. With a map, the component q is
-the position along the track.
+A map adds two observations (Wenz 2024), the lateral and the vertical offset from the track, with the map sigmas. If the
+map is wrong, both observations are faulty. With a map, the component q is the position along the track.
 """
 
 from __future__ import annotations
@@ -30,10 +29,10 @@ from railfix.core.notebook import NotebookTable
 from railfix.core.settings import Settings
 from railfix.integrity.protection.risk import one_sided_k, set_sums
 
-#: Number of bisections for a level. They reduce the interval from 1e4 m to less than a tenth of a micrometre.
+#: Number of bisections for a level. They reduce an interval of 1e4 m to less than 0.1 micrometres.
 _HALVINGS: Final = 48
 _LONGEST_M: Final = 1e4
-_BLOCK_SIZE: Final = 4_000_000  #: Number of elements of the largest array for a block of epochs.
+_BLOCK_SIZE: Final = 4_000_000  #: Largest number of elements of an array of a block of epochs.
 #: A matrix is singular if its determinant is below this fraction of the product of its diagonal.
 _SINGULAR: Final = 1e-12
 
@@ -41,63 +40,63 @@ _SINGULAR: Final = 1e-12
 class AraimBudget(Settings):
     """Allocation of integrity and continuity risk.
 
-    The defaults are the LPV-200 values of ADD 3.0, with the vertical budget also used along the track.
+    The defaults are the LPV-200 values of ADD 3.0. Along the track, the vertical values are used.
     """
 
-    #: Probability of hazardously misleading information per approach (or per sample), by component.
+    #: Probability of hazardously misleading information per approach or sample, for each position component.
     phmi_along: float = Field(default=9.8e-8, gt=0, lt=1)
     phmi_vertical: float = Field(default=9.8e-8, gt=0, lt=1)
     phmi_horizontal: float = Field(default=2e-9, gt=0, lt=1)
-    #: Probability that noise alone makes the separations inconsistent, by component.
+    #: Probability that noise alone makes the solution separations exceed their thresholds, for each component.
     false_alarm_along: float = Field(default=3.9e-6, gt=0, lt=1)
     false_alarm_vertical: float = Field(default=3.9e-6, gt=0, lt=1)
     false_alarm_horizontal: float = Field(default=9e-8, gt=0, lt=1)
-    #: Largest total probability of faults that are not modes. Modes with more simultaneous faults, up to `most_faults`,
-    #: are added until this limit is met.
+    #: Largest total probability of faults that are not modes. The number of simultaneous faults in a mode is increased,
+    #: up to `most_faults`, until this limit is met.
     unmonitored: float = Field(default=8e-8, gt=0, lt=1)
     most_faults: int = Field(default=2, ge=1, le=3)  #: Largest number of simultaneous faults in a mode.
-    map_prior: float = Field(default=1e-4, ge=0, lt=1)  #: Probability that the map is wrong; 0 omits this fault mode.
+    map_prior: float = Field(default=1e-4, ge=0, lt=1)  #: Prior probability of a wrong map; 0 omits this mode.
 
 
 @dataclass(frozen=True, kw_only=True)
 class AraimGeometry:
-    """N observations at each of T epochs: the ranges and, with a map, the two constraints of the map."""
+    """N observations at each of T epochs: ranges and, with a map, two map constraints."""
 
     #: Partial derivatives of each observation with respect to the P unknowns (position, then one clock per
     #: constellation), shape (T, N, P). Values of unused observations are ignored.
     design: Floats
-    sigma_int_m: Floats  #: Standard deviations for integrity, shape (T, N); NaN for unused observations.
-    sigma_acc_m: Floats  #: Standard deviations for accuracy, shape (T, N); NaN for unused observations.
+    sigma_int_m: Floats  #: Integrity standard deviations, shape (T, N); NaN for unused observations.
+    sigma_acc_m: Floats  #: Accuracy standard deviations, shape (T, N); NaN for unused observations.
     bias_m: Floats  #: Largest nominal bias of each observation, shape (T, N).
-    prior: Floats  #: Prior probability of a fault of a single observation, shape (N,).
-    together: Masks  #: Sets of observations with a common fault (of a constellation or the map), shape (C, N).
-    together_prior: Floats  #: Prior probability of the common fault of each set, shape (C,).
+    prior: Floats  #: Prior probability of a fault of each single observation, shape (N,).
+    together: Masks  #: Sets of observations affected by a constellation or map fault, shape (C, N).
+    together_prior: Floats  #: Prior probability of each constellation or map fault, shape (C,).
 
     @property
     def used(self) -> Masks:
-        """True for observations with both sigmas, shape (T, N)."""
+        """True for observations that have both standard deviations, shape (T, N)."""
         return np.asarray(np.isfinite(self.sigma_int_m) & np.isfinite(self.sigma_acc_m))
 
 
 @dataclass(frozen=True, kw_only=True)
 class AraimLevels:
-    """Protection levels of T epochs for Q components of the position."""
+    """Protection levels of T epochs for Q position components."""
 
-    #: Protection levels, shape (T, Q); infinite where unmonitored faults are more probable than the risk, NaN without a
-    #: position.
+    #: Protection levels, shape (T, Q); NaN without a position. A level is infinite where unmonitored faults are more
+    #: probable than the risk, or above 10 km.
     level_m: Floats
-    sigma_int_m: Floats  #: Standard deviations for integrity of the position from all observations, shape (T, Q).
-    sigma_acc_m: Floats  #: Standard deviations for accuracy of the position from all observations, shape (T, Q).
+    sigma_int_m: Floats  #: Integrity standard deviations of the position from all observations, shape (T, Q).
+    sigma_acc_m: Floats  #: Accuracy standard deviations of the position from all observations, shape (T, Q).
     modes: Integers  #: Number of fault modes, shape (T,).
-    unmonitored: Floats  #: Probability of faults that are not modes, or that leave no position, shape (T,).
+    unmonitored: Floats  #: Probability of faults that are not modes or prevent a position, shape (T,).
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class AraimResult(NotebookTable):
-    """ARAIM protection levels of T epochs; NaN without a position."""
+    """ARAIM protection levels of T epochs; NaN where there is no position."""
 
     along: AraimLevels  #: Level along the track, with the map as a constraint.
-    space: AraimLevels  #: Levels east, north and up, without the map.
+    space: AraimLevels  #: Levels to the east, to the north and upwards, without the map.
 
     @property
     def horizontal_m(self) -> Floats:
@@ -108,7 +107,7 @@ class AraimResult(NotebookTable):
 def araim_levels(
     geometry: AraimGeometry, phmi: Sequence[float], false_alarm: Sequence[float], budget: AraimBudget
 ) -> AraimLevels:
-    """Compute the protection levels of the first Q unknowns; `phmi` and `false_alarm` have one value per unknown."""
+    """Compute the protection levels of the first Q unknowns; `phmi` and `false_alarm` have Q values each."""
     epochs, count = geometry.sigma_int_m.shape
     events = np.concatenate([np.eye(count, dtype=bool), geometry.together])  # single faults, then common faults; (E, N)
     sets = [list(s) for size in range(1, budget.most_faults + 1) for s in combinations(range(len(events)), size)]
@@ -141,7 +140,7 @@ def _block(
     probability = np.where(size[None, :] <= order[:, None], probability, 0.0)
     out = np.concatenate([np.zeros((1, masks.shape[1]), dtype=bool), masks])
     kept = used[:, None, :] & ~out
-    # two modes that remove the same used observations have the same position
+    # observations kept in each mode have weight 1/sigma^2, removed and unused observations 0
     weight = np.where(kept, 1.0 / np.where(used, geometry.sigma_int_m[rows], 1.0)[:, None] ** 2, 0.0)
     gain, sigma = _gains(design, weight, components)
     acc = np.where(used, geometry.sigma_acc_m[rows], 0.0)[:, None, None]
@@ -177,7 +176,7 @@ def _event_priors(geometry: AraimGeometry, used: Masks) -> Floats:
 
 
 def _order(prior: Floats, budget: AraimBudget) -> tuple[Integers, Floats]:
-    """Return the largest number of simultaneous events in a mode, and a bound of the probability of more events."""
+    """Return the largest number of events in a mode, and an upper bound on the probability of more events."""
     more = set_sums(prior, budget.most_faults + 1)[:, 2:]
     enough = more <= budget.unmonitored
     order = np.where(enough.any(axis=1), np.argmax(enough, axis=1) + 1, budget.most_faults)
@@ -185,7 +184,7 @@ def _order(prior: Floats, budget: AraimBudget) -> tuple[Integers, Floats]:
 
 
 def _gains(design: Floats, weight: Floats, components: int) -> tuple[Floats, Floats]:
-    """Return the rows of S (T, F, Q, N) and the sigmas (T, F, Q) of each mode; NaN sigmas without a position."""
+    """Return the gains S (T, F, Q, N) and the sigmas (T, F, Q) of each mode; without a position, sigmas are NaN."""
     normal = np.einsum("tnp,tfn,tnr->tfpr", design, weight, design, optimize=True)
     diagonal = np.diagonal(normal, axis1=2, axis2=3)
     # a clock without observations is treated as known
@@ -202,7 +201,7 @@ def _gains(design: Floats, weight: Floats, components: int) -> tuple[Floats, Flo
 
 
 def _solve(offset: Floats, sigma: Floats, weight: Floats, risk: Floats) -> Floats:
-    """Find by bisection the levels (T, Q) at which the tails (T, F, Q) add up to the risk; infinite above 1e4 m."""
+    """Return the levels (T, Q) at which the tail probabilities of F modes add up to `risk`; infinite above 10 km."""
     low, high = np.zeros(risk.shape), np.full(risk.shape, _LONGEST_M)
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
@@ -213,7 +212,7 @@ def _solve(offset: Floats, sigma: Floats, weight: Floats, risk: Floats) -> Float
 
 
 class SupportArrays(NamedTuple):
-    """Integrity support by channel, shape (M,), and fault probabilities by constellation letter."""
+    """Integrity support of each channel, shape (M,), and fault probability of each constellation letter."""
 
     sigma_ura_m: Floats
     sigma_ure_m: Floats
@@ -223,13 +222,13 @@ class SupportArrays(NamedTuple):
 
 
 class SatelliteSupport(Protocol):
-    """Integrity support of the satellites (`railfix.integrity.protection.support_message.IntegritySupport`)."""
+    """Interface of integrity support, implemented by `support_message.IntegritySupport`."""
 
     def holds(self, time: Datetimes) -> Masks:
-        """Return whether the support is valid at epochs, shape (T,)."""
+        """Return True for epochs at which the support is valid, shape (T,)."""
 
     def notes(self, time: Datetimes) -> tuple[str, ...]:
-        """Return notes, one sentence each, on the validity of the support at epochs, shape (T,)."""
+        """Return notes on the validity of the support at the given epochs."""
 
     def arrays(self, satellites: Sequence[str]) -> SupportArrays:
-        """Return the support of each channel from the name of its satellite ("G07"); NaN without support."""
+        """Return the support of each channel's satellite ("G07"); NaN for satellites without support."""

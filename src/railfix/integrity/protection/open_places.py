@@ -1,9 +1,9 @@
-"""Possible positions on the line but away from the tangent, under the fault hypotheses of a protection level.
+"""Search for possible true positions that the protection level does not cover, where the line leaves its tangent.
 
-A level bounds the error along the tangent. Where the line bends, or passes close to itself, the position computed
-without a faulty satellite can be a point of the line away from the tangent. Under each hypothesis of the level, the sum
-of squared residuals is a quadratic form of the position. This form is evaluated along the line unless a bound excludes
-positions away from the tangent.
+A protection level bounds the error along the tangent. Where the line bends or passes close to itself, the true position
+can be on the line but away from the tangent. Under each fault hypothesis, the sum of squared residuals is a quadratic
+form of the position. This form is evaluated along the line, except where a bound already excludes positions away from
+the tangent.
 """
 
 from __future__ import annotations
@@ -22,29 +22,30 @@ from railfix.integrity.raim import LinearModel
 from railfix.positioning.antenna_rows import AntennaRows
 from railfix.positioning.search_index import SearchIndex
 
-#: Largest distance searched [m], at which the linear model of a range has an error of 0.7 m.
+#: Largest search radius [m]. At this distance, the linear range model has an error of 0.7 m.
 _FURTHEST_M: Final = 5000.0
-_NEGLIGIBLE: Final = 0.01  #: Fraction of a sample's risk that is allowed for positions outside the search radius.
+_NEGLIGIBLE: Final = 0.01  #: Fraction of a sample's risk allocated to positions outside the search radius.
 
 
 class Forms(NamedTuple):
-    """Sums of squared residuals under K hypotheses of T epochs, as quadratic forms of the offset d from the position.
+    """Sums of squared residuals of T epochs under K hypotheses, as quadratic forms of the offset d from the position.
 
-    ``q(d) = constant - 2 d . slope + d^T matrix d`` in noise variances, with d along, across and up at the position.
-    The map error is assumed to be equal in all horizontal directions, because the tangent changes with the position.
+    The form is ``q(d) = constant - 2 d . slope + d^T matrix d`` in noise variances; d has the components along, across
+    and up. The map error is assumed to be equal in all horizontal directions, because the tangent changes along the
+    line.
     """
 
     prior: Floats  # (T, K) probability of the hypothesis, 0 for unused entries
     form: Floats  # (T, K, 10) constant, slope [1/m], upper triangle of the matrix [1/m^2]
-    lowest_m: Floats  # (T, K) distance to the minimum of the form; NaN where singular
-    depth: Floats  # (T, K) depth of the minimum
-    widest_m2: Floats  # (T, K) trace of the inverse matrix, a bound of its largest eigenvalue
+    lowest_m: Floats  # (T, K) distance from the position to the form's minimum; NaN where singular
+    depth: Floats  # (T, K) value of the form at the position minus its minimum
+    widest_m2: Floats  # (T, K) trace of the inverse matrix, an upper bound on its largest eigenvalue
 
     def radius_m(self, risk: float) -> Floats:
         """Return the search radius of each hypothesis, shape (T, K); 0 for a hypothesis without a prior.
 
-        Positions outside the radii have at most 1 % of the risk in total, divided equally among the hypotheses. The
-        radius is at most 5 km.
+        True positions outside the radii have at most 1 % of the risk, divided equally among the hypotheses. A radius is
+        at most 5 km.
         """
         possible = self.prior > 0
         each = _NEGLIGIBLE * risk / np.maximum(np.count_nonzero(possible, axis=1, keepdims=True), 1)
@@ -53,7 +54,7 @@ class Forms(NamedTuple):
         return np.where(possible, np.fmin(radius, _FURTHEST_M), 0.0)
 
 
-_BOUND_SIZE: Final = 200_000  #: Limit of the number of epochs in a block, times the squared number of channels.
+_BOUND_SIZE: Final = 200_000  #: Largest product of a block's number of epochs and squared number of channels.
 
 
 def places_beyond_the_level(
@@ -66,13 +67,13 @@ def places_beyond_the_level(
     risk: RiskBudget,
     sides: Masks,
 ) -> Masks:
-    """Return the mask of epochs whose level does not cover a possible position on the line, shape (T,).
+    """Return True for epochs whose protection level does not cover a possible position on the line, shape (T,).
 
-    Under a hypothesis J, a position whose sum of squared residuals is larger than the minimum by x variances is the
-    true position with a probability of at most ``Q(sqrt(x))``. For each hypothesis, this probability is computed for
-    the best position beyond the level, and multiplied by the prior of J. An epoch is marked where the sum exceeds the
-    risk of a sample. Values of `scale` below 1 count as 1. `sides`, shape (T, S, M), marks the low satellites of each
-    side.
+    Under a hypothesis J, let the sum of squared residuals of a position exceed the minimum by x variances. This
+    position is the true position with a probability of at most ``Q(sqrt(x))``. For each hypothesis, this probability is
+    computed for the best position beyond the protection level and multiplied by the prior of J. The result is True
+    where the sum over the hypotheses exceeds the risk of a sample. A `scale` below 1 counts as 1. `sides`, shape (T, S,
+    M), marks the low satellites of each side of the track.
     """
     result = np.zeros(len(arc_m), dtype=bool)
     rows = (np.isfinite(level_m) & np.isfinite(arc_m) & np.isfinite(model.wsse)).nonzero()[0]
@@ -106,7 +107,7 @@ def places_beyond_the_level(
 
 
 def _risk_of_block(index: SearchIndex, arc_m: Floats, level_m: Floats, forms: Forms, risk: RiskBudget) -> Floats:
-    """Return an upper bound of the probability that the true position is beyond the level and off the tangent, (T,)."""
+    """Return an upper bound on the probability of a true position beyond the level and off the tangent, shape (T,)."""
     radius = forms.radius_m(risk.risk_per_sample)
     sections = _around(index, arc_m, level_m, radius.max(axis=1))
     return kernels.off_tangent.risk_beyond(forms.prior, forms.form, radius, *sections)
@@ -115,17 +116,17 @@ def _risk_of_block(index: SearchIndex, arc_m: Floats, level_m: Floats, forms: Fo
 def _around(
     index: SearchIndex, arc_m: Floats, level_m: Floats, radius_m: Floats
 ) -> tuple[Indices, Floats, Floats, Floats, Floats]:
-    """Return the line sections within a radius of each position, divided at the level, in the order of the epochs.
+    """Return the line sections within `radius_m` of each position, split at the distance `level_m`, by epoch.
 
     Returns
     -------
     first : ndarray of int, shape (T + 1,)
-        Index of the first section of each epoch, followed by the total number P.
+        Index of each epoch's first section, followed by the total number P of sections.
     start_m, tangent : ndarray, shape (P, 3)
-        Start point and unit vector of each section, along, across and up relative to the position.
+        Start point relative to the position and unit vector of each section, as components along, across and up.
     length_m : ndarray, shape (P,)
     beyond_m : ndarray, shape (P,)
-        Distance from the position, for sections beyond the level and off the tangent; infinite for other sections.
+        Distance of each section from the position; infinite for sections within the level or near the tangent.
     """
     line = index.trajectory
     here, place = line.segment_at(arc_m)[0], line.at_arc(arc_m)
@@ -138,7 +139,7 @@ def _around(
     epoch, vertex = epoch[inside], vertex[inside]
     start = np.einsum("pij,pj->pi", axes[epoch], line.ecef_m[vertex] - place[epoch])
     tangent, length = np.einsum("pij,pj->pi", axes[epoch], line.tangent[vertex]), line.length_m[vertex]
-    # |start + s tangent| = level at both roots; the level covers the part of the section between the roots.
+    # |start + s tangent| = level has two roots s; the level covers the part of the section between the roots.
     middle = -np.einsum("pi,pi->p", start, tangent)
     square = middle**2 - np.einsum("pi,pi->p", start, start) + level_m[epoch] ** 2
     half = np.sqrt(np.maximum(square, 0.0))

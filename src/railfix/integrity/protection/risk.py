@@ -1,9 +1,9 @@
-"""Integrity risk of a protection level, and its allocation to fault hypotheses.
+"""Integrity risk of a protection level, and allocation of this risk to fault hypotheses.
 
-The risk per hour (P1 2.4: 1e-7, RTCA DO-229D) is divided by the number of independent samples in an hour. The risk of a
-sample, minus the probability of faults that are not hypotheses, is allocated to the hypotheses. A hypothesis is a set
-of shared faults (of a constellation, of the low satellites of a side, of the map) and of faulty single satellites.
-Hypotheses with equal shared faults and equal numbers of single satellites form a class.
+The risk per hour (1e-7 in P1 2.4 and RTCA DO-229D) is divided by the number of independent samples in an hour. The risk
+of a sample, minus the probability of faults that are not hypotheses, is allocated to the hypotheses. A hypothesis is a
+set of faults: shared faults (of a constellation, of the map, or of the low satellites on one side of the track) and
+faults of single satellites. Hypotheses with equal shared faults and equal numbers of single satellites form a class.
 """
 
 from __future__ import annotations
@@ -27,21 +27,20 @@ from railfix.core.constants import SUPPORTED_SIDE_PRIOR
 from railfix.core.settings import Settings
 from railfix.integrity.raim import LinearModel
 
-#: Probability that a satellite is faulty at a given time: 1e-5 for GPS (1e-5 per hour, lasting an hour), 3e-5 for
-#: Galileo (EU-U.S. Working Group C, ARAIM Technical Subgroup, Milestone 3 report, and the later Galileo service
-#: definition). Other constellations get the value of Galileo, because their commitments are more recent.
+#: Probability that a satellite is faulty at a given time: 1e-5 for GPS (one-hour faults at a rate of 1e-5 per hour),
+#: and 3e-5 for Galileo (EU-U.S. Working Group C, ARAIM Technical Subgroup, Milestone 3 report, and the later Galileo
+#: service definition). Other constellations have the Galileo value, because their commitments are more recent.
 SATELLITE_PRIOR: Final[Mapping[str, float]] = MappingProxyType(
     {"G": 1e-5, "J": 3e-5, "E": 3e-5, "C": 3e-5, "R": 3e-5, "S": 3e-5, "I": 3e-5}
 )
-MOST_EXCLUDED: Final = 2  #: Largest number of excluded satellites with which a level is computed (P1 2.3(4)).
+MOST_EXCLUDED: Final = 2  #: Largest number of excluded satellites for a finite level (P1 2.3(4)).
 MOST_TOGETHER: Final = 4  #: Largest number of faulty single satellites in a hypothesis.
 
 
 def k_factor(risk: float) -> float:
-    """Return K such that a one-dimensional error exceeds K sigma, on either side, with probability `risk`.
+    """Return the factor K for which a one-dimensional error exceeds K sigma, on either side, with probability `risk`.
 
-    A risk of 1e-7 gives 5.33, 1e-8 gives 5.73. The Rayleigh factor of a horizontal position is larger. A ValueError is
-    raised if the risk is not in (0, 1].
+    K is 5.33 for a risk of 1e-7. Raise ValueError if the risk is not in (0, 1].
     """
     if not 0.0 < risk <= 1.0:
         raise ValueError(f"a risk is a probability above 0, at most 1, got {risk}")
@@ -59,50 +58,50 @@ Probability = Annotated[float, Field(ge=0, lt=1)]  #: Probability from 0 to belo
 class RiskBudget(Settings):
     """Integrity risk, its allocation, and the probabilities of faults."""
 
-    #: Probability that the error exceeds the level without a warning; P1 2.4: 1e-7 per hour.
+    #: Probability per hour that the error exceeds the protection level without a warning; 1e-7 in P1 2.4.
     risk_per_hour: float = Field(default=1e-7, gt=0, lt=1)
-    #: Number of independent samples in an hour, 3600 s divided by the correlation time of the errors. The default
-    #: assumes 10 s: multipath changes within seconds on a moving train, within tens of seconds on a stationary train,
-    #: and SBAS corrections change within minutes (DO-229D appendix J counts 10 samples per hour). A larger number is
-    #: conservative. From 10 to 3600 samples, the fault-free K grows by 0.9.
+    #: Number of independent samples in an hour: 3600 s divided by the correlation time of the errors. The default
+    #: assumes a correlation time of 10 s. Multipath changes within seconds on a moving train and within tens of seconds
+    #: at standstill, SBAS corrections within minutes (DO-229D appendix J: 10 samples per hour). A larger number is
+    #: conservative: the fault-free K for 3600 samples is 0.9 larger than for 10.
     samples_per_hour: float = Field(default=360.0, gt=0, allow_inf_nan=False)
-    #: Fractions of an epoch's risk for the parts of the level (no, one and two faults), with a sum of at most 1. The
-    #: level is lowered from the largest part until the sum of all tails equals the sum of the fractions. Doubling a
-    #: fraction lowers a K of 6 by only 0.1, and a K of 3 by 0.2, so the default is a third each.
+    #: Fractions of an epoch's risk for the level parts for no, one and two faults; their sum is at most 1. The level is
+    #: lowered from the largest part until the sum of all tail probabilities equals the risk of all parts. Doubling a
+    #: fraction lowers a K of 6 by only 0.1 and a K of 3 by only 0.2, so the defaults are equal.
     fault_free_share: float = Field(default=1.0 / 3.0, gt=0)
     one_fault_share: float = Field(default=1.0 / 3.0, gt=0)
     two_fault_share: float = Field(default=1.0 / 3.0, gt=0)
-    #: Fraction of the risk for faults that are not hypotheses. If these faults are more probable, further faults become
-    #: hypotheses, up to four simultaneous satellites and three shared faults (constellation, side, map).
+    #: Fraction of the risk for faults that are not hypotheses. If these faults are more probable, more faults become
+    #: hypotheses, with up to four satellites and three shared faults (constellation, side, map) at the same time.
     unchecked_share: float = Field(default=0.3, gt=0, lt=1)
-    #: Fraction of the risk for epochs with one excluded satellite; the fraction for epochs with two is equal.
+    #: Fraction of the risk for epochs with one excluded satellite; the same fraction is allocated to two.
     exclusion_share: float = Field(default=0.1, ge=0, lt=0.5)
-    #: Probability per epoch that noise alone makes the separations inconsistent; 1e-3 in P4.
+    #: Probability per epoch that noise alone makes the solution separations exceed their thresholds; 1e-3 in P4.
     false_alarm: float = Field(default=1e-3, gt=0, lt=1)
-    #: Probability that the signal of a satellite is faulty, by constellation.
+    #: Probability that a satellite is faulty at a given time, for each constellation.
     satellite_prior: dict[str, Probability] = Field(default_factory=lambda: dict(SATELLITE_PRIOR))
-    #: Additional probability of a local fault (multipath, interference) of a satellite. The default is an assumption
-    #: until the probability is measured on the line (P1 7).
+    #: Additional probability that a satellite's signal has a local fault (multipath, interference). The default is an
+    #: assumption until the probability is measured on the line (P1 7).
     local_prior: float = Field(default=1e-5, ge=0, lt=1)
     #: Probability that the map is wrong by more than its stated error, for example because of a parallel track, heights
-    #: without the geoid, or a different reference frame. The value is an assumption. With 0, a wrong map is no
+    #: without the geoid, or a different reference frame. The default is an assumption. With 0, a wrong map is no
     #: hypothesis.
     map_prior: float = Field(default=1e-4, ge=0, lt=1)
-    #: Probability that the low satellites of one side of the track are faulty together (`SUPPORTED_SIDE_PRIOR`). No
-    #: data supports a smaller value, and every output of the levels reports a smaller setting. With 0, a faulty side is
-    #: no hypothesis.
+    #: Probability that the low satellites on one side of the track are faulty together. No data support a value below
+    #: the default, so every output of protection levels reports a smaller setting. With 0, a faulty side is no
+    #: hypothesis.
     side_prior: float = Field(default=SUPPORTED_SIDE_PRIOR, ge=0, lt=1)
-    #: Elevation up to which satellites count as low. 45 deg is the top of a wall whose height equals its distance.
+    #: Elevation up to which satellites count as low. A wall whose distance equals its height reaches 45 deg.
     side_elevation_deg: float = Field(default=45.0, gt=0, le=90.0)
-    #: Satellites assumed to be faulty together: the low satellites left or right of the track ("beside"), or also all
-    #: satellites ahead or behind, as in the filter ("all"). With "all", levels are up to three times as large, because
-    #: the geometry of a single epoch along the track is weak without the satellites ahead or behind.
+    #: Satellites assumed to be faulty together. With "beside", these are the low satellites left or right of the track.
+    #: With "all", as in the filter, these are also all satellites ahead or behind; levels are then up to three times as
+    #: large, because single-epoch geometry along the track is weak without the satellites ahead or behind.
     late_sides: Literal["beside", "all"] = "beside"
-    #: Whether the priors were measured on this line (``railfix error-model``). Levels with assumed priors are called
-    #: indicative in every output, and no hourly risk is claimed. "measured" requires `local_prior` and `side_prior`.
+    #: Whether the priors were measured on this line (``railfix error-model``). If they are assumed, every output calls
+    #: the levels indicative, and no hourly risk is claimed. "measured" requires `local_prior` and `side_prior`.
     priors: Literal["assumed", "measured"] = "assumed"
-    #: Probability of a fault shared by many satellites of a constellation, by constellation. The level does not cover
-    #: such faults of constellations without a value.
+    #: Probability of a fault common to many satellites, for each constellation. For constellations without a value, the
+    #: level does not cover such faults.
     constellation_prior: dict[str, Probability] = Field(default_factory=dict)
 
     @model_validator(mode="after")
@@ -124,7 +123,7 @@ class RiskBudget(Settings):
 
     @property
     def risk_per_sample(self) -> float:
-        """Integrity risk of an epoch, including the parts for exclusions and unchecked faults."""
+        """Integrity risk of a sample, including the parts for exclusions and unchecked faults."""
         return self.risk_per_hour / self.samples_per_hour
 
     @property
@@ -133,9 +132,9 @@ class RiskBudget(Settings):
         return k_factor(self.risk_per_sample)
 
     def prior(self, systems: Sequence[str]) -> Floats:
-        """Return the fault probability of each channel, the sum of satellite prior and local prior, shape (M,).
+        """Return the fault probability of each channel: the sum of satellite and local prior, shape (M,).
 
-        A ValueError is raised if a constellation has no satellite prior.
+        Raise ValueError if a constellation has no satellite prior.
         """
         unknown = sorted(set(systems) - set(self.satellite_prior))
         if unknown:
@@ -143,11 +142,11 @@ class RiskBudget(Settings):
         return np.array([self.satellite_prior[s] + self.local_prior for s in systems], dtype=np.float64)
 
     def sample_risk(self, n_used: ArrayLike, n_excluded: ArrayLike, beyond: ArrayLike = 0.0) -> Floats:
-        """Return the risk of an epoch for the satellites that remain after exclusions, any shape.
+        """Return the integrity risk of epochs, allocated to the satellites that remain after exclusions.
 
-        `beyond` is the probability of unchecked faults, which is subtracted first. Any e satellites could have been
-        excluded, so the part of the risk for e exclusions is divided by the number of sets of e satellites. The result
-        is 0 for more than `MOST_EXCLUDED` exclusions, and where `beyond` exceeds the risk.
+        `beyond` is the probability of unchecked faults, which is first subtracted from the risk. Any e satellites could
+        have been excluded, so the risk for e exclusions is divided by the number of sets of e satellites. The result is
+        0 for more than `MOST_EXCLUDED` exclusions, and where `beyond` exceeds the risk.
         """
         used, out = np.asarray(n_used, dtype=np.float64), np.asarray(n_excluded, dtype=np.int64)
         if (out < 0).any():
@@ -162,10 +161,10 @@ class RiskBudget(Settings):
 
 
 def set_sums(prior: Floats, most: int) -> Floats:
-    """Return, for k = 0 to `most`, the sum over all sets of k faults of the product of their priors, (T, most + 1).
+    """Return the probabilities of sets of k = 0 to `most` faults, shape (T, most + 1).
 
-    `prior` has the shape (T, M). Column k bounds the probability of k or more faults. The sums are computed by Newton's
-    identities.
+    `prior` has the shape (T, M). Column k is the sum, over all sets of k faults, of the product of their priors; it
+    bounds the probability of k or more faults. The sums are computed by Newton's identities.
     """
     power, powers = prior, []
     for _ in range(most):
@@ -178,12 +177,12 @@ def set_sums(prior: Floats, most: int) -> Floats:
     return np.stack(sums, axis=1)
 
 
-#: Largest number of shared faults in a hypothesis; the probability of more shared faults is subtracted from the risk.
+#: Largest number of shared faults in a hypothesis. The probability of more is subtracted from the risk.
 _MOST_SHARED: Final = 3
-FEW: Final = 2  #: Allocations are cached only for up to this number of epochs; a live chunk has one per antenna.
-#: Number of cached allocations; they are used again when satellites reappear from behind obstacles.
+FEW: Final = 2  #: Allocations of at most this number of epochs are cached. A live chunk has one epoch per antenna.
+#: Number of cached allocations. They are used again when obstructed satellites reappear.
 REMEMBERED: Final = 512
-_MOST_SETS: Final = 46_376  #: Largest number of hypotheses in a class, the number of sets of four of 34 satellites.
+_MOST_SETS: Final = 46_376  #: Largest number of hypotheses in a class: four of 34 satellites.
 
 
 class Shared(NamedTuple):
@@ -203,18 +202,18 @@ class Shared(NamedTuple):
 class Allocation:
     """Allocation of the risk of T epochs; compared by identity."""
 
-    prior: Floats  # (T, M) fault probability of each satellite, 0 for unused channels
+    prior: Floats  # (T, M) fault probability of each channel, 0 for unused channels
     groups: tuple[str, ...]  # letters of the C constellations with a `constellation_prior`
     shared: tuple[Shared, ...]  # B sets of shared faults, of which the first is empty
     members: Masks  # (T, B, M) satellites affected by each set of shared faults
-    shared_prior: Floats  # (T, B) probability of each set of shared faults, 0 where absent
-    order: Indices  # (T, B) largest number of single satellites left out with each set; -1 if the set is no hypothesis
+    shared_prior: Floats  # (T, B) probability of each set of shared faults; 0 if too few of its satellites are used
+    order: Indices  # (T, B) largest number of satellites that are faulty in addition to each set; -1: no hypothesis
     beyond: Floats  # (T,) probability of the classes that are not hypotheses
     fault_free: Floats  # (T,) risk allocated to no fault
     one: Floats  # (T,) risk allocated to one fault
     two: Floats  # (T,) risk allocated to two faults
-    more: Floats  # (T,) risk allocated to three or more faults, 0 where these are not hypotheses
-    reserved: Floats  # (T,) probability of satellite pairs, where pairs are not hypotheses, else 0
+    more: Floats  # (T,) risk allocated to three or more faults; 0 where no such hypothesis exists
+    reserved: Floats  # (T,) probability of two faulty satellites; 0 where pairs are hypotheses
     k_false_alarm: Floats  # (T,) factor K of the thresholds
 
 
@@ -223,17 +222,18 @@ def allocate(
 ) -> Allocation:
     """Choose the fault hypotheses of each epoch and divide the risk among them.
 
-    The hypotheses are the following classes: single satellites, alone and with a wrong map; pairs of satellites, where
-    pairs are more probable than their allocation; constellations, alone and with one satellite; sides; and the most
-    probable other classes, until the rest is within the risk for unchecked faults. `out`, shape (T,), is the number of
-    excluded satellites; `sides`, shape (T, S, M), are the sets of satellites that may be faulty together.
+    Always hypotheses: a single satellite, a side, and a constellation or the map, each alone and with one satellite.
+    Pairs of satellites are hypotheses where they are more probable than the risk allocated to two faults. The most
+    probable other classes are added until the remaining classes are within the risk for unchecked faults. `out`, shape
+    (T,), is the number of excluded satellites. `sides`, shape (T, S, M), are the sets of satellites that may be faulty
+    together.
     """
     used = model.used
     sides = sides & used[:, None]
-    if len(used) <= FEW:  # in live operation, consecutive epochs mostly have the same satellites
+    if len(used) <= FEW:  # live epochs mostly repeat the satellites of the previous epoch
         given = (used.tobytes(), out.tobytes(), sides.tobytes())
         return _of_few_epochs(_Same(risk), tuple(systems), *given, sides.shape[1], wrong_map)
-    # Many epochs of a chunk have the same satellites, so the allocation is computed once per set of satellites.
+    # Many epochs of a chunk have equal satellites, so the allocation is computed once per set of satellites.
     bits = np.packbits(np.concatenate([used, sides.reshape(len(used), -1)], axis=1), axis=1)
     keys = np.concatenate([bits, np.ascontiguousarray(out)[:, None].view(np.uint8)], axis=1)
     _, first, which = np.unique(keys.view(f"V{keys.shape[1]}")[:, 0], return_index=True, return_inverse=True)
@@ -259,7 +259,7 @@ class _Same:
 def _of_few_epochs(
     risk: _Same, systems: tuple[str, ...], used: bytes, out: bytes, sides: bytes, count: int, wrong_map: bool
 ) -> Allocation:
-    """Return the cached allocation of up to `FEW` epochs; its arrays must not be changed."""
+    """Return the cached allocation of at most `FEW` epochs. Callers must not change its arrays."""
     channels, excluded = len(systems), np.frombuffer(out, dtype=np.int64).copy()
     return _allocate(
         np.frombuffer(used, dtype=bool).reshape(len(excluded), channels).copy(), systems, risk.risk, excluded,
@@ -272,12 +272,12 @@ def _allocate(
 ) -> Allocation:
     of_channel = risk.prior(systems)
     prior = used * of_channel
-    # Excluded satellites count among the satellites that may be faulty, with the largest prior.
+    # Excluded satellites may be faulty, too, and have the largest prior.
     everyone = np.concatenate([prior, (np.arange(MOST_EXCLUDED) < out[:, None]) * of_channel.max(initial=0.0)], axis=1)
     letters = [s for s in dict.fromkeys(systems) if risk.constellation_prior.get(s, 0.0) > 0.0]
     of_letter = np.array([[t == s for t in systems] for s in letters], dtype=bool).reshape(len(letters), len(systems))
     members = np.concatenate([used[:, None] & of_letter, sides], axis=1)
-    # A shared fault of a constellation needs at least one used satellite; a fault of a side needs two.
+    # A constellation fault requires at least one used satellite, a fault of a side at least two.
     nominal = np.array([risk.constellation_prior[s] for s in letters] + [risk.side_prior] * sides.shape[1])
     least = np.array([1] * len(letters) + [2] * sides.shape[1])
     event_prior = nominal * ((members & used[:, None]).sum(axis=2) >= least)
@@ -298,7 +298,7 @@ def _allocate(
     )
     beyond = classes.rest(order)
     left = risk.sample_risk(n, out, beyond)
-    # Hypotheses of three or more faults get a quarter of the risk of every part.
+    # Where they exist, hypotheses of three or more faults have a quarter of each part's risk.
     more = (order + [s.kind for s in shared] >= 3).any(axis=1, where=order >= 0)
     left = np.where(more, 0.75, 1.0) * left
     parts = [s * left for s in (risk.fault_free_share, risk.one_fault_share, risk.two_fault_share)]
@@ -321,7 +321,7 @@ def _allocate(
 
 @lru_cache(maxsize=64)
 def _fault_sets(events: tuple[int, ...], constellations: int, *, wrong_map: bool) -> tuple[tuple[Shared, ...], Masks]:
-    """Return the B sets of up to three shared faults, smaller sets first, and the mask `_Classes.within` (B, B)."""
+    """Return the B sets of up to three shared faults, sorted by number of faults, and `_Classes.within`."""
     sets = []
     for size in range(_MOST_SHARED + 1):
         for some in combinations([*events, -1] if wrong_map else events, size):
@@ -336,13 +336,13 @@ def _fault_sets(events: tuple[int, ...], constellations: int, *, wrong_map: bool
 
 @dataclass(frozen=True)
 class _Classes:
-    """Classes of hypotheses of T epochs: B sets of shared faults, each with 0 to `MOST_TOGETHER` single satellites."""
+    """Hypothesis classes of T epochs: B sets of shared faults, each with 0 to `MOST_TOGETHER` single satellites."""
 
     each: Floats  # (T, B) prior of each set of shared faults
-    within: Masks  # (B, B) true where the second set is a subset of the first with one fault less
+    within: Masks  # (B, B) true where the second set is the first set without one of its faults
     sums: Floats  # (T, MOST_TOGETHER + 2) `set_sums` of the satellite priors
     further: Floats  # (T,) probability of more than `_MOST_SHARED` shared faults
-    least: Sequence[int]  # length B, number of single satellites always left out with each set; -1 for no hypothesis
+    least: Sequence[int]  # length B, smallest allowed value of `Allocation.order`
 
     def _take(self, rows: Indices) -> _Classes:
         return replace(self, each=self.each[rows], sums=self.sums[rows], further=self.further[rows])
@@ -350,7 +350,7 @@ class _Classes:
     def rest(self, order: Indices) -> Floats:
         """Return the probability of faults that are not hypotheses, shape (T,).
 
-        The probability of a set of shared faults that is not a hypothesis includes the supersets of the set.
+        If a set of shared faults is not a hypothesis, its probability includes all its supersets.
         """
         whole = (order < 0) & (self.each > 0.0)
         covered = whole.astype(np.float64) @ self.within.T > 0.0
@@ -358,11 +358,12 @@ class _Classes:
         return np.asarray(each.sum(axis=1) + self.further)
 
     def choose(self, share: float, likely: Sequence[float], satellite: float, used: Integers) -> Indices:
-        """Choose the largest number of single satellites left out with each set of shared faults, shape (T, B).
+        """Return `Allocation.order`, shape (T, B): the largest number of satellites left out with each set of shared
+        faults.
 
-        Faults with a total probability of `share` may remain unchecked. `likely`, length B, are the nominal priors of
-        the sets of shared faults, and `satellite` is the mean prior of a satellite. The most probable classes are
-        chosen first.
+        The most probable classes are chosen first, until the total probability of the other classes is at most `share`.
+        `likely`, length B, are the nominal priors of the sets of shared faults. `satellite` is the mean prior of a
+        satellite.
         """
         sizes = np.arange(MOST_TOGETHER + 1)
         feasible = scipy.special.comb(used[:, None], sizes) <= _MOST_SETS

@@ -1,13 +1,14 @@
-"""Protection level along the track by solution separation over fault hypotheses.
+"""Protection level along the track by solution separation.
 
-If ``|x_J - x| <= T_J``, the position x is within T_J of the position x_J, which a fault of the subset J does not
-affect. At the level L, the tail probabilities of all hypotheses add up to the risk (EU-U.S. WG-C ARAIM, in one
-dimension):
+The position x_J is computed without the satellites of the fault hypothesis J, so that a fault of these satellites does
+not affect it. At consistent epochs, ``|x_J - x| <= T_J`` for all J. At the level L, the tail probabilities of all
+hypotheses add up to the risk (EU-U.S. WG-C ARAIM, in one dimension):
 
     ``2 Q((L - b_0)/sigma_0) + sum_J p_J Q((L - T_J - b_J)/sigma_J) = risk``
 
-The thresholds ``T_J = K_fa sigma(x_J - x)`` divide the false-alarm probability evenly. The search for the level starts
-at an upper bound, the largest of ``K_ff sigma_0 + b_0`` (no fault) and of ``T_J + K sigma_J + b_J`` over all J.
+The thresholds are ``T_J = K_fa sigma(x_J - x)``; each has an equal fraction of the false-alarm probability. The search
+for the level starts at an upper bound, the largest of ``K_ff sigma_0 + b_0`` (no fault) and all ``T_J + K sigma_J +
+b_J``.
 """
 
 from __future__ import annotations
@@ -29,14 +30,14 @@ from railfix.core.notebook import NotebookTable
 from railfix.integrity.protection.risk import FEW, MOST_TOGETHER, REMEMBERED, Allocation, RiskBudget, allocate
 from railfix.integrity.raim import LinearModel
 
-_BLOCK_SIZE: Final = 200_000  #: Number of elements of a block's array of hypotheses.
-_OF_MORE: Final = 3  #: Index of the tails of three or more faults among the kinds of hypotheses.
+_BLOCK_SIZE: Final = 200_000  #: Largest number of elements of a block's hypothesis arrays.
+_OF_MORE: Final = 3  #: Index of the part for three or more faults.
 
 
 class Cause(IntEnum):
-    """Hypothesis that uses most of an epoch's risk, or the reason for an infinite or missing protection level.
+    """Hypothesis with the largest part of an epoch's risk, or reason for an infinite or missing protection level.
 
-    A fault affects a satellite, a constellation, a side of the track (or both sides), or the map.
+    A single fault affects a satellite, a constellation, one or both sides of the track, or the map.
     """
 
     #: Fault-free noise of the position.
@@ -45,9 +46,10 @@ class Cause(IntEnum):
     ONE_FAULT = 1
     #: Two simultaneous faults.
     TWO_FAULTS = 2
-    #: Infinite level: the probability of undetectable satellite faults exceeds the risk allocated to them.
+    #: Infinite level: undetectable satellite faults are more probable than the risk allocated to them.
     UNCHECKED = 3
-    #: Infinite level: faults that are not hypotheses exceed the risk, or too many satellites are excluded.
+    #: Infinite level: faults that are not hypotheses are more probable than the risk, or too many satellites are
+    #: excluded.
     BUDGET = 4
     #: No position.
     NO_POSITION = 5
@@ -55,13 +57,13 @@ class Cause(IntEnum):
     THREE_FAULTS = 6
     #: Infinite level: local faults cannot be bounded on this part of the line.
     UNBOUNDED = 7
-    #: Infinite level as for `UNCHECKED`, mostly because of faults of a constellation, alone or with single satellites.
+    #: Infinite level as for `UNCHECKED`; the faults are mostly faults of a constellation.
     UNCHECKED_CONSTELLATION = 8
-    #: Infinite level as for `UNCHECKED`, mostly because of faults of one or both sides of the track.
+    #: Infinite level as for `UNCHECKED`; the faults are mostly faults of one or both sides of the track.
     UNCHECKED_SIDE = 9
-    #: Infinite level as for `UNCHECKED`, mostly because of faults of the map.
+    #: Infinite level as for `UNCHECKED`; the faults are mostly faults of the map.
     UNCHECKED_MAP = 10
-    #: Infinite level as for `UNCHECKED`, mostly because of simultaneous faults of constellations, sides or the map.
+    #: Infinite level as for `UNCHECKED`; the faults are mostly simultaneous faults of constellations, sides or the map.
     UNCHECKED_TOGETHER = 11
 
 
@@ -69,46 +71,46 @@ class Cause(IntEnum):
 class ProtectionLevel(NotebookTable):
     """Protection levels along the track of T epochs; NaN without a position."""
 
-    #: Level at which the sum of all tails is within the risk, shape (T,); infinite for the reason in `cause`. The level
-    #: is at most the largest of the following parts, which need not use their risk allocations fully.
+    #: Protection level, shape (T,), at which the tail probabilities add up to at most the risk. If infinite, see
+    #: `cause`.
     level_m: Floats
-    #: Parts of the level for no fault, one fault and two faults, shape (T,); 0 where the hypotheses of a part have a
-    #: total probability within the allocation of this part.
+    #: Level parts for no fault, one fault and two faults, shape (T,). A part is 0 if the total probability of its
+    #: hypotheses is within the risk allocated to it.
     fault_free_m: Floats
     one_fault_m: Floats
     two_fault_m: Floats
-    sigma_m: Floats  #: Standard deviation of the position along the track without a fault, shape (T,).
-    #: Factor K of each part, shape (T,); -inf where the part is 0 for this reason.
+    sigma_m: Floats  #: Fault-free standard deviation of the position along the track, shape (T,).
+    #: Factor K of each part, shape (T,); -inf where the part is 0.
     k_fault_free: Floats
     k_one_fault: Floats
     k_two_faults: Floats
-    k_false_alarm: Floats  #: Factor K of the thresholds, shape (T,).
-    separation: Floats  #: Largest ``|x_J - x|/T_J``, shape (T,); 0 where no satellite can be left out.
-    #: True where the separation is at most 1, shape (T,); False without a position. The level is invalid where False.
+    k_false_alarm: Floats  #: Factor K_fa of the thresholds, shape (T,).
+    separation: Floats  #: Largest ``|x_J - x|/T_J`` of all J, shape (T,); 0 where no position x_J exists.
+    #: True where the separation is at most 1, shape (T,). Where False, the protection level is invalid.
     consistent: Masks
-    #: Channel that determines `one_fault_m`, shape (T,); -1 if a constellation, a side or the map determines it.
+    #: Channel whose fault determines `one_fault_m`, shape (T,); -1 if another fault does.
     worst_one: Indices
-    worst_two: Indices  #: Pair of channels that determines `two_fault_m`, shape (T, 2); -1 if no pair does.
-    #: Letter of the constellation that determines `one_fault_m`, shape (T,); empty if no constellation does.
+    worst_two: Indices  #: Channels whose faults determine `two_fault_m`, shape (T, 2); -1 if others do.
+    #: Constellation whose fault determines `one_fault_m`, shape (T,); empty if another fault does.
     worst_constellation: Strings
     unchecked_risk: Floats  #: Probability of faults that are not hypotheses, subtracted from the risk, shape (T,).
-    cause: Codes  #: `Cause`, shape (T,).
+    cause: Codes  #: `Cause` of each epoch, shape (T,).
 
 
 class RangeBounds(NamedTuple):
-    """Paired overbound of each range, shapes (T, M) or (M,) [m]: smallest standard deviation, largest nominal bias."""
+    """Paired overbound: smallest standard deviation and largest bias of each range, shape (T, M) or (M,) [m]."""
 
     sigma_m: ArrayLike | None = None
     bias_m: ArrayLike | None = None
 
 
 class MapDeviation(NamedTuple):
-    """Information on the map error across and up in addition to the map sigmas."""
+    """Lateral and vertical map error in addition to the map sigmas."""
 
-    bias_m: ArrayLike = 0.0  #: Map offset not covered by the sigmas, shape (T, 2) or (2,).
-    #: Offset across and up of the antenna position computed without the map, shape (T, 2) [m], and the inverse
-    #: covariance of this offset, shape (T, 2, 2) [1/m^2] (0 if unknown). If given, a wrong map is a hypothesis with the
-    #: prior `RiskBudget.map_prior`.
+    bias_m: ArrayLike = 0.0  #: Map offset not covered by the map sigmas, shape (T, 2) or (2,).
+    #: Lateral and vertical offset from the map of the antenna position computed without the map, shape (T, 2) [m], and
+    #: inverse covariance of this offset, shape (T, 2, 2) [1/m^2] (0 if unknown). If present, a wrong map is a
+    #: hypothesis with the prior `RiskBudget.map_prior`.
     seen: tuple[Floats, Floats] | None = None
 
 
@@ -134,19 +136,19 @@ def protection_level(
     scale : array_like, shape (T,) or ()
         Noise scale, which multiplies the sigmas of the ranges but not the map error.
     overbound : RangeBounds, optional
-        By default, the sigma of each range follows from its weight and the scale, and the bias is 0.
+        Lower limit of the sigma of each range, and its nominal bias. By default, the sigma follows from the weight of
+        the range and the noise scale, and the bias is 0.
     sides : ndarray of bool, shape (T, S, M), optional
-        Sets of satellites that reflections can make faulty together. Each set is a hypothesis with the prior
+        S sets of satellites that reflections can make faulty together. Each set is a hypothesis with the prior
         `RiskBudget.side_prior`.
     n_excluded : array_like of int, shape (T,) or (), or ndarray of bool, shape (T, M)
-        Number of satellites excluded by RAIM, or `RaimResult.excluded`; satellites rejected by the screens do not
-        count.
+        Number of satellites excluded by RAIM, or `RaimResult.excluded`. Satellites rejected by screens do not count.
 
     Raises
     ------
     ValueError
         The model is not on the line, the noise scale is not positive, `systems` does not name each channel, or the
-        model contains an excluded satellite (`exclude_faults` returns ranges and positions without them).
+        model contains a satellite excluded according to `n_excluded`.
     """
     if model.interest != 1:
         raise ValueError("a level along the track needs a model on the line (linear_model)")
@@ -187,7 +189,7 @@ def protection_level(
 
 
 def _by_epoch(values: ArrayLike | None, epochs: int, width: int) -> Floats:
-    """Return the values of each epoch, shape (T, width); shape (T, 0) for None."""
+    """Return values with the shape (T, width), or (T, 0) for None."""
     if values is None:
         return np.zeros((epochs, 0))
     return _broadcast(np.asarray(values, dtype=np.float64), (epochs, width))
@@ -198,7 +200,7 @@ def _broadcast(values: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
 
 
 def _empty(epochs: int, plan: Allocation) -> ProtectionLevel:
-    """Return the result of epochs that all lack a position."""
+    """Return the result of epochs without a position."""
     floats = "level_m fault_free_m one_fault_m two_fault_m sigma_m k_fault_free k_one_fault k_two_faults k_false_alarm"
     return ProtectionLevel(
         **{name: np.full(epochs, np.nan) for name in (*floats.split(), "separation")},
@@ -209,7 +211,7 @@ def _empty(epochs: int, plan: Allocation) -> ProtectionLevel:
 
 
 def _blocks(model: LinearModel, plan: Allocation, rows: Indices) -> Iterator[Indices]:
-    """Return blocks of epochs with similar numbers of hypotheses, so that no block is wider than necessary."""
+    """Return blocks of epochs with similar numbers of hypotheses, so that block arrays are small."""
     if len(rows) <= FEW:
         return iter([rows] if len(rows) else [])
     used = model.used[rows].sum(axis=1)
@@ -223,7 +225,7 @@ def _blocks(model: LinearModel, plan: Allocation, rows: Indices) -> Iterator[Ind
 
 
 class Errors(NamedTuple):
-    """Range and map errors given to `protection_level`; shape (T, 0) where not given."""
+    """Range and map errors passed to `protection_level`; shape (T, 0) if not passed."""
 
     scale: Floats
     least_sigma_m: Floats
@@ -234,7 +236,7 @@ class Errors(NamedTuple):
 
 
 class Asked(NamedTuple):
-    """Hypotheses of a block of epochs: fields of `Allocation`, and indices into the arrays of all hypotheses."""
+    """Hypotheses of a block of epochs: fields of `Allocation`, and indices into the hypothesis arrays."""
 
     prior: Floats  # (T, M)
     members: Masks  # (T, B, M) satellites of each set of shared faults
@@ -242,8 +244,8 @@ class Asked(NamedTuple):
     shared_prior: Floats  # (T, B)
     order: Indices  # (T, B)
     k_false_alarm: Floats  # (T,)
-    first: Indices  # (B, MOST_TOGETHER + 1) index of the first hypothesis with 0, 1, ... single satellites; -1 for none
-    bounds: Indices  # (5,) index of the first hypothesis with no, one, two, and more faults; then the number of all
+    first: Indices  # (B, MOST_TOGETHER + 1) first hypothesis of each class; -1: no hypothesis
+    bounds: Indices  # (5,) first hypothesis with 0, 1, 2 and more faults, and number of hypotheses
 
 
 class _Names(NamedTuple):
@@ -251,7 +253,7 @@ class _Names(NamedTuple):
 
     asked: Asked
     share: Floats  # (T, 4) risk for no fault, one, two, and more faults
-    letters: Strings  # names of the single faults after the n channels: constellation letters, then empty
+    letters: Strings  # constellation letters of single faults, numbered after the n channels; else empty
     pairs: Indices  # (K, 2) pairs of channels; the last entry is (-1, -1)
 
 
@@ -259,7 +261,7 @@ def _level_of_block(rows: Indices, model: LinearModel, plan: Allocation, given: 
     """Compute the fields of `ProtectionLevel` of a block of epochs with positions."""
     of_block = Errors(*(np.ascontiguousarray(each[rows]) for each in given))
     n = int(model.used.sum(axis=1).max())
-    # the allocation of few epochs, and the data derived from it, are cached
+    # allocations of few epochs and the data derived from them are cached
     every = len(rows) == len(plan.beyond) <= FEW
     asked, share, letters, pairs = _names_of_few(plan, n) if every else _names(plan, rows, n)
     channel, offset, sigma, weight, separation = kernels.hypotheses.tails_of_hypotheses(model.arrays, of_block, asked)
@@ -292,7 +294,7 @@ def _level_of_block(rows: Indices, model: LinearModel, plan: Allocation, given: 
 
 
 def _find_unchecked(plan: Allocation, asked: Asked, open_to_faults: Floats, n: int) -> Codes:
-    """Return the `Cause` (T,) of the shared faults that have most of the unchecked probability (T, K)."""
+    """Return the `Cause` of the shared faults with the largest part of the unchecked probability (T, K)."""
     spent, causes = [], []
     for shared, first in zip(plan.shared, asked.first.tolist(), strict=True):
         classes = [open_to_faults[:, at : at + math.comb(n, k)].sum(axis=1) for k, at in enumerate(first) if at >= 0]
@@ -309,7 +311,7 @@ def _find_unchecked(plan: Allocation, asked: Asked, open_to_faults: Floats, n: i
 
 @lru_cache(maxsize=256)
 def _places(kinds: tuple[int, ...], most: tuple[int, ...], n: int) -> tuple[Indices, Indices]:
-    """Return `Asked.first` and `Asked.bounds` for sets of shared faults with up to `most` of n satellites each."""
+    """Return `Asked.first` and `Asked.bounds`; up to `most` of n satellites are added to each set of shared faults."""
     bounds, place = [], 0
     first = np.full((len(kinds), MOST_TOGETHER + 1), -1, dtype=np.intp)
     for kind in range(_OF_MORE + 1):
@@ -327,7 +329,7 @@ def _names_of_few(plan: Allocation, n: int) -> _Names:
 
 
 def _names(plan: Allocation, rows: Indices, n: int) -> _Names:
-    """Return the hypotheses of epochs with at most n used channels, ordered by the number of faults."""
+    """Return the hypotheses of epochs with at most n used channels, sorted by number of faults."""
     order = plan.order[rows]
     kinds = tuple(shared.kind for shared in plan.shared)
     first, bounds = _places(kinds, tuple(order.max(axis=0).tolist()), n)
@@ -343,7 +345,7 @@ def _names(plan: Allocation, rows: Indices, n: int) -> _Names:
 
 
 def _channels(channel: Indices, place: Indices) -> Indices:
-    """Return the channels at compact indices, shape (T, k); -1 where the index is -1."""
+    """Return the channels at indices among the used channels, shape (T, k); -1 for an index of -1."""
     return np.where(place >= 0, channel[np.arange(len(channel))[:, None], np.maximum(place, 0)], -1)
 
 
@@ -356,9 +358,9 @@ def _pairs(n: int) -> Indices:
 class LevelStatus(IntEnum):
     """Status of an epoch's protection level relative to the alarm limit."""
 
-    #: The level is within the alarm limit.
+    #: The protection level is within the alarm limit.
     AVAILABLE = 0
-    #: The level exceeds the alarm limit, or the position is missing.
+    #: The protection level exceeds the alarm limit, or there is no position.
     UNAVAILABLE = 1
-    #: The ranges are inconsistent, so that the level is invalid.
+    #: The ranges are inconsistent, so that the protection level is invalid.
     ALARM = 2

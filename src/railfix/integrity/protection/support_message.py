@@ -1,4 +1,4 @@
-"""Integrity support message of ARAIM: standard deviations, biases and fault probabilities of satellites."""
+"""ARAIM integrity support message: standard deviations, biases and fault probabilities of satellites."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ Satellite = Annotated[str, Field(pattern=r"^[GJECR][0-9]{2}$")]
 class StatedSupport(Settings):
     """Integrity support of a satellite."""
 
-    #: Standard deviation of the range error due to orbit and clock, for integrity.
+    #: Integrity standard deviation of the range error caused by orbit and clock.
     sigma_ura_m: float = Field(gt=0)
-    #: Standard deviation of the range error due to orbit and clock, for accuracy and continuity.
+    #: Accuracy and continuity standard deviation of the range error caused by orbit and clock.
     sigma_ure_m: float = Field(gt=0)
-    bias_m: float = Field(ge=0)  #: Largest nominal bias of the range (b_nom).
+    bias_m: float = Field(ge=0)  #: Largest nominal range bias (b_nom).
     prior: float = Field(ge=0, lt=1)  #: Probability that the satellite is faulty at a given time (P_sat).
 
 
@@ -44,12 +44,12 @@ class IntegritySupport(Settings):
     """Integrity support message (EU-U.S. Working Group C, ARAIM milestone 3 report; ADD 3.0, table 2)."""
 
     format: Literal["railfix integrity support 1"]
-    #: Start of the validity period [GPS time]; None if not stated. Epochs outside this period have no ARAIM level.
+    #: Start of the validity period (GPS time). Epochs outside the validity period have no ARAIM level.
     valid_from: datetime | None = None
-    valid_until: datetime | None = None  #: End of the validity period [GPS time]; None if not stated.
-    #: Support by constellation letter; a constellation without support is not used in the levels.
+    valid_until: datetime | None = None  #: End of the validity period (GPS time).
+    #: Support of each constellation, by letter. Constellations without support are not used in ARAIM levels.
     constellation: dict[Letter, ConstellationSupport] = Field(min_length=1)
-    #: Support of single satellites, which replaces the support by constellation.
+    #: Support of single satellites, which replaces the support of their constellation.
     satellite: dict[Satellite, StatedSupport] = Field(default_factory=dict)
 
     @model_validator(mode="after")
@@ -62,14 +62,14 @@ class IntegritySupport(Settings):
         return self
 
     def holds(self, time: Datetimes) -> Masks:
-        """Return whether the message is valid at epochs, shape (T,)."""
+        """Return True for epochs at which the message is valid, shape (T,)."""
         first, last = (
             np.datetime64("NaT" if end is None else end, "ns") for end in (self.valid_from, self.valid_until)
         )
         return ~((time < first) | (time > last))
 
     def notes(self, time: Datetimes) -> tuple[str, ...]:
-        """Return a note if the message states no end of validity, or is not valid at some epochs."""
+        """Return a note if the message has no `valid_until` or is not valid at all epochs."""
         if self.valid_until is None:
             return ("integrity support message: without valid_until it is not known whether it has expired",)
         if self.holds(time).all():
@@ -81,7 +81,7 @@ class IntegritySupport(Settings):
         )
 
     def arrays(self, satellites: Sequence[str]) -> SupportArrays:
-        """Return the support of each channel from the name of its satellite ("G07"); NaN without support."""
+        """Return the support of each channel's satellite ("G07"); NaN for satellites without support."""
         of_each = [self.satellite.get(name) or self.constellation.get(name[0]) for name in satellites]
         ura, ure, bias, prior = (
             np.array([np.nan if each is None else getattr(each, name) for each in of_each], dtype=np.float64)
@@ -91,7 +91,7 @@ class IntegritySupport(Settings):
 
 
 def read_integrity_support(path: FilePath) -> IntegritySupport:
-    """Read an integrity support message from a TOML file; raise InputFileError for other files."""
+    """Read an integrity support message from a TOML file; raise InputFileError if it is not one."""
     values = read_toml(path, what="an integrity support message")
     if values.get("format") != FORMAT:
         raise InputFileError(path, f"is not an integrity support message: format = '{FORMAT}' was expected")

@@ -1,6 +1,6 @@
 """RAIM: fault detection, exclusion of up to two satellites, and reliability (P1 2.3(4); P4).
 
-The functions take a `LinearModel` of the position, on the line or in space::
+Exclusion and reliability use a `LinearModel` of the position, on the line or in space::
 
     detection = detect(constrained.wsse, constrained.residual_m, ranges.n_used - ranges.n_clocks - 1, scale=scale)
     failing = np.flatnonzero(detection.detected)
@@ -9,8 +9,8 @@ The functions take a `LinearModel` of the position, on the line or in space::
     # solve again without the channels in `exclusion.excluded`, then
     level = reliability(linear_model(ranges, trajectory, constrained.arc_m), scale=scale).protection_level_m
 
-The noise scale multiplies the sigmas of the ranges after the fit. The fit uses the unscaled weights, so that the scale
-does not change the balance between ranges and map error.
+The noise scale multiplies the range sigmas after the fit. The fit itself uses unscaled weights, so that the noise scale
+does not change the relative weights of ranges and map error.
 """
 
 import lazy_loader

@@ -1,9 +1,9 @@
-"""Reliability: minimal detectable biases, and the effect of undetected biases on the position.
+"""Reliability: minimal detectable biases, and their effect on the position.
 
-The test misses a fault of noncentrality lambda with the stated probability (P4). This fault corresponds to a bias of
-``sigma_i sqrt(lambda / r_ii)`` in the range of satellite i, because the statistic contains only the fraction r_ii of
-the squared bias. ``slope_i`` is the position change per unit of the statistic's square root. The protection level is
-the largest slope times ``sigma0 sqrt(lambda)`` (P4), plus K sigma for the noise of the position.
+The chi-square test misses a fault of noncentrality lambda with the probability `missed_detection` (P4). For satellite
+i, this fault is a range bias of ``sigma_i sqrt(lambda / r_ii)``, because only the fraction r_ii of the squared bias
+appears in the statistic. ``slope_i`` is the position change per unit of the statistic's square root. The protection
+level is the largest slope times ``sigma0 sqrt(lambda)`` (P4), plus K sigma for the position noise.
 """
 
 from __future__ import annotations
@@ -23,40 +23,40 @@ from railfix.core.constants import LEAST_REDUNDANCY
 from railfix.integrity.raim.exclusion import RaimLimits
 from railfix.integrity.raim.position_model import LinearModel, compact
 
-#: Effect of a range on the position, in position sigmas, up to which it counts as zero.
+#: Effects of a range on the position up to this number of position sigmas count as zero.
 _NO_EFFECT: Final = 1e-6
-_BLOCK_SIZE: Final = 40_000  #: Number of elements of a block's array of channel pairs.
+_BLOCK_SIZE: Final = 40_000  #: Largest number of elements of a block's array of channel pairs.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reliability:
-    """Reliability of T epochs by M channels for the chi-square test."""
+    """Reliability of the chi-square test at T epochs with M channels."""
 
-    noncentrality: Floats  #: Noncentrality lambda for the epoch's degrees of freedom, shape (T,); NaN if not testable.
-    #: Range error missed with the stated probability; infinite if no other channel tests the range; NaN if the range is
-    #: unused; shape (T, M).
+    noncentrality: Floats  #: Noncentrality lambda of each epoch's missed fault, shape (T,); NaN if not testable.
+    #: Range error that the test misses with the probability `missed_detection`, shape (T, M); infinite for ranges that
+    #: no other range tests, NaN for unused ranges.
     minimal_detectable_bias_m: Floats
     #: Position error per unit of the statistic's square root, shape (T, M); NaN for unused channels.
     slope_m: Floats
-    #: Largest slope for errors of two satellites, shape (T,); NaN unless `RaimLimits.faults` is 2.
+    #: Largest slope for simultaneous errors of two satellites, shape (T,); only if `RaimLimits.faults` is 2, else NaN.
     pair_slope_m: Floats
-    worst: Indices  #: Channel of the largest single slope, shape (T,); -1 if no channel has a slope.
-    #: Standard deviation along the line, or in space along the longest axis of the horizontal ellipse, shape (T,).
+    worst: Indices  #: Channel with the largest `slope_m`, shape (T,); -1 if all slopes are NaN.
+    #: Position standard deviation, shape (T,): along the line, or along the major axis of the horizontal ellipse.
     position_sigma_m: Floats
-    #: Position error due to a fault missed with the stated probability: the largest slope times sqrt(lambda), (T,).
+    #: Position error caused by the missed fault: largest slope times sqrt(lambda), shape (T,).
     fault_level_m: Floats
-    noise_level_m: Floats  #: Noise part of the level, K sigma, shape (T,).
-    #: Sum of fault and noise level, shape (T,); infinite where a fault cannot be detected; NaN without a position.
+    noise_level_m: Floats  #: Noise part of the protection level: K sigma, shape (T,).
+    #: Sum of fault and noise level, shape (T,); infinite where a fault is undetectable, NaN without a position.
     protection_level_m: Floats
     available: Masks  #: True where the protection level is finite, shape (T,).
-    alarm: Masks  #: True where the level exceeds the alarm limit or is NaN, shape (T,).
+    alarm: Masks  #: True where the protection level exceeds the alarm limit or is NaN, shape (T,).
 
 
 def reliability(model: LinearModel, *, limits: RaimLimits | None = None, scale: ArrayLike = 1.0) -> Reliability:
     """Compute minimal detectable biases, slopes and protection levels from a model after exclusions.
 
-    The limits of the chi-square test are used in every mode. `scale`, shape (T,) or (), is the noise scale as for
-    `detect`; it does not affect the map error in `position_sigma_m`.
+    The limits of the chi-square test are used even in mode "fixed". `scale`, shape (T,) or (), is the noise scale (see
+    `detect`); it does not affect the map error in `position_sigma_m`.
     """
     limits = limits or RaimLimits()
     scale = np.broadcast_to(np.asarray(scale, dtype=np.float64), (len(model),))
@@ -78,7 +78,7 @@ def reliability(model: LinearModel, *, limits: RaimLimits | None = None, scale: 
     if limits.faults == 2:
         pair = _pair_slopes(model, scale, sigma)
         largest = np.fmax(largest, pair)
-    # Without redundancy, a fault of any size is undetected.
+    # without redundancy, a fault of any size is undetected
     fault = np.where(located & (model.freedom < 1), np.inf, largest * root)
     # K: two-sided Gaussian along the line, Rayleigh with the longest axis (an upper bound) in the plane
     risk = limits.noise_risk
@@ -102,9 +102,9 @@ def reliability(model: LinearModel, *, limits: RaimLimits | None = None, scale: 
 
 
 def noncentrality(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Floats:
-    """Return the noncentrality that the chi-square test misses with probability `missed_detection` (P4), same shape.
+    """Return the noncentrality that the chi-square test misses with the probability `missed_detection` (P4).
 
-    The result is NaN below 1 degree of freedom.
+    The result has the shape of `freedom` and is NaN below 1 degree of freedom.
     """
     limits = limits or RaimLimits()
     freedom = np.asarray(freedom, dtype=np.int64)
@@ -132,7 +132,7 @@ def _largest_eigenvalue(a: Floats, b: Floats, c: Floats) -> Floats:
 
 
 def _single_slopes(model: LinearModel, share: Floats, scale: Floats, sigma: Floats) -> Floats:
-    """Return the slopes for errors of single satellites, shape (T, M) [m]; infinite where undetectable."""
+    """Return `Reliability.slope_m` for a noise scale; slopes of undetectable errors are infinite."""
     effect = np.sqrt((model.gain_m**2).sum(axis=2))
     checked = share > LEAST_REDUNDANCY
     unchecked = np.where(effect > _NO_EFFECT * sigma[:, None], np.inf, 0.0)
@@ -142,10 +142,10 @@ def _single_slopes(model: LinearModel, share: Floats, scale: Floats, sigma: Floa
 
 
 def _pair_slopes(model: LinearModel, scale: Floats, sigma: Floats) -> Floats:
-    """Return the largest slope for errors of any two satellites, shape (T,) [m]; NaN where fewer than two are used.
+    """Return the largest slope for errors of two satellites, shape (T,) [m]; NaN for fewer than two used satellites.
 
-    The squared slope is the largest ``|G^T b|^2 / (b^T S_EE b)`` over errors b of the pair, i.e. the largest eigenvalue
-    of ``G^T S_EE^-1 G`` with the gains G of the pair (2 x k).
+    The squared slope of a pair is the maximum of ``|G^T b|^2 / (b^T S_EE b)`` over its errors b. The maximum is the
+    largest eigenvalue of ``G^T S_EE^-1 G``, where G are the gains of the pair (2 x k).
     """
     result = np.full(len(model), np.nan)
     rows = np.flatnonzero(np.isfinite(sigma) & (np.count_nonzero(model.used, axis=1) >= 2))
@@ -181,8 +181,8 @@ def _pair_block(model: LinearModel, sigma: Floats) -> Floats:
     largest = _largest_eigenvalue(entry(0, 0), entry(0, 1), entry(1, 1)) if wide else entry(0, 0)
     squared = np.where(regular, largest / np.where(regular, determinant, 1.0), 0.0)
 
-    # Errors proportional to (sqrt c, -+ sqrt a) do not appear in the residuals. If these errors do not change the
-    # position, the slope of the pair is not larger than the single slopes.
+    # If the pair is not regular, errors proportional to (sqrt c, -+ sqrt a) do not appear in the residuals. If they do
+    # not change the position either, the slope of the pair is at most the larger single slope.
     x, y = np.sqrt(np.maximum(c, 0.0)), -np.copysign(np.sqrt(np.maximum(a, 0.0)), b)
     hidden = np.linalg.norm(x[..., None] * first + y[..., None] * second, axis=2)
     blind = both & ~regular & (hidden > _NO_EFFECT * sigma[:, None] * np.hypot(x, y))

@@ -1,8 +1,9 @@
-"""Fault detection by the sum of squared residuals (P4: chi-square; P1 2.3(4): 100 m^2), and fault exclusion.
+"""Fault detection with the sum of squared residuals (P4: chi-square test; P1 2.3(4): 100 m^2), and fault exclusion.
 
-Leaving out the satellites E is equivalent to estimating a bias for each satellite of E. The estimated biases are ``b_E
-= S_EE^-1 nu_E``, the WSSE decreases by ``nu_E^T b_E``, and the position changes by ``-Q B_E^T b_E``. Every satellite
-and every pair can therefore be tested without a new solution.
+Leaving out a set E of satellites is equivalent to estimating a bias for each satellite of E. The estimated biases are
+``b_E = S_EE^-1 nu_E``. The weighted sum of squared residuals (WSSE) decreases by ``nu_E^T b_E``, and the position
+changes by ``-Q B_E^T b_E``. The symbols are defined in `position_model`. Every satellite and every pair can thus be
+tested without a new solution.
 """
 
 from __future__ import annotations
@@ -22,38 +23,37 @@ from railfix.core.constants import LEAST_REDUNDANCY
 from railfix.core.settings import Settings
 from railfix.integrity.raim.position_model import Compact, LinearModel, compact
 
-_TABLE_STEP: Final = 64  #: The size of a table of thresholds is a multiple of this number.
+_TABLE_STEP: Final = 64  #: The number of thresholds in a table is a multiple of this number.
 
 
 class RaimLimits(Settings):
     """Limits of fault detection, fault exclusion and reliability."""
 
-    mode: Literal["chi_square", "fixed"] = "chi_square"  #: Threshold from a false-alarm rate (P4), or fixed (P1).
-    #: Probability that noise alone is detected as a fault; 0.001 in P4. The error of an excluded satellite must exceed
-    #: the noise at this probability (chi-square mode).
+    mode: Literal["chi_square", "fixed"] = "chi_square"  #: Threshold from `false_alarm` (P4), or fixed (P1).
+    #: Probability that noise alone is detected as a fault; 0.001 in P4. In mode "chi_square", the error of an excluded
+    #: satellite must also be significant at this probability.
     false_alarm: float = Field(default=1e-3, gt=0, lt=1)
-    #: Probability of missing a fault of the minimal detectable size. P4 gives no value.
+    #: Probability of missing a fault of the minimal detectable size. P4 states no value.
     missed_detection: float = Field(default=1e-3, gt=0, lt=1)
-    #: Limit of mode "fixed" for the sum of squared residuals, and for the squared error of an excluded satellite; P1
+    #: In mode "fixed", limit of the sum of squared residuals, and smallest squared error of an excluded satellite; P1
     #: table 6 ("FDE 2 SAT, 100 m2").
     fixed_limit_m2: float = Field(default=100.0, gt=0)
-    #: Largest number of satellites excluded at an epoch, 0 to 2; 2 in P1 2.3(4).
+    #: Largest number of satellites excluded at an epoch; 2 in P1 2.3(4).
     max_excluded: int = Field(default=2, ge=0, le=2)
     min_redundancy: int = Field(default=1, ge=1)  #: Minimum degrees of freedom after an exclusion.
-    #: Probability that noise makes the correct exclusion fit worse than a competing exclusion by the separation
-    #: (chi-square, one degree of freedom). If another exclusion of as many satellites passes and fits worse by less
-    #: than the separation, the epoch is inseparable.
+    #: Probability that noise alone makes the correct exclusion fit worse than a competing exclusion by the separation
+    #: (chi-square, one degree of freedom). An epoch is inseparable if another exclusion of as many satellites passes
+    #: and its WSSE is larger by less than the separation.
     separation_risk: float = Field(default=1e-3, gt=0, le=1)
-    #: If the positions after two exclusions are closer than this distance, the exclusions do not compete, because the
-    #: choice hardly changes the position (for example with the two satellites of a separate clock). With 0, exclusions
-    #: always compete.
+    #: Exclusions do not compete if their positions are closer than this distance, because the choice hardly changes the
+    #: position (for example with the two satellites of a separate clock). With 0, exclusions always compete.
     same_position_m: float = Field(default=0.0, ge=0)
-    #: Two-sided probability of noise beyond K sigma in the protection level; 1 gives K = 0, which is P4's ``HSlope
-    #: sigma0 sqrt(lambda)``.
+    #: Two-sided probability that the position noise exceeds the noise part K sigma of the protection level. A value of
+    #: 1 means K = 0, as in ``HSlope sigma0 sqrt(lambda)`` of P4.
     noise_risk: float = Field(default=1e-3, gt=0, le=1)
     #: Alarm limit of the protection level. P4 accepts an error within a car length, 20 m.
     alarm_limit_m: float = Field(default=20.0, gt=0)
-    faults: int = Field(default=1, ge=1, le=2)  #: Number of simultaneous faults that the level covers; 1 in P4.
+    faults: int = Field(default=1, ge=1, le=2)  #: Number of simultaneous faults covered by the level; 1 in P4.
 
     @model_validator(mode="after")
     def _rates_below_one(self) -> Self:
@@ -63,21 +63,21 @@ class RaimLimits(Settings):
 
     @cached_property
     def separation(self) -> float:
-        """Minimum WSSE difference from a competing exclusion, in noise variances."""
+        """Minimum difference between the WSSE of an exclusion and of a competing exclusion, in noise variances."""
         return float(scipy.special.chdtri(1, self.separation_risk))
 
     @cached_property
     def own_error(self) -> float:
-        """Limit of the squared normalised error of an excluded satellite."""
+        """Smallest squared normalised error of an excluded satellite."""
         return float(scipy.special.chdtri(1, self.false_alarm))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Detection:
-    """Result of fault detection for T epochs."""
+    """Result of fault detection at T epochs."""
 
-    #: WSSE divided by the squared noise scale, or in fixed mode the sum of squared residuals [m^2], shape (T,); NaN
-    #: without a position.
+    #: Test statistic, shape (T,): WSSE divided by the squared noise scale, or in mode "fixed" the sum of squared
+    #: residuals [m^2]. NaN without a position.
     statistic: Floats
     threshold: Floats  #: Threshold of the statistic, shape (T,); NaN where not testable.
     freedom: Integers  #: Degrees of freedom, shape (T,).
@@ -93,20 +93,20 @@ def detect(
     limits: RaimLimits | None = None,
     scale: ArrayLike = 1.0,
 ) -> Detection:
-    """Test the residuals of positions for a fault (P4: ``T >= T_D``).
+    """Test the residuals of each position for a fault (P4: ``T >= T_D``).
 
-    The arguments are results of the solvers, or the attributes of the same names of a `LinearModel`.
+    The arguments are results of a solver, or attributes of a `LinearModel`.
 
     Parameters
     ----------
     wsse : array_like, shape (T,)
         Weighted sum of squared residuals; NaN without a position.
     residual_m : array_like, shape (T, M) [m]
-        Residuals, 0 or NaN for unused channels; used in fixed mode only. Residuals of a `LinearModel` include the map
-        error, residuals of a `Constrained` position do not. Both residuals are equal only for an exact map (a sigma of
-        a millimetre), as in P1.
+        Residuals, 0 or NaN for unused channels; used in mode "fixed" only. `LinearModel.residual_m` includes the map
+        error, `Constrained.residual_m` does not. They are equal only for an exact map (sigma of a millimetre), as in
+        P1.
     freedom : array_like of int, shape (T,)
-        Ranges minus unknowns: ``ranges.n_used - ranges.n_clocks - 1`` on the line, ``- 3`` instead in space.
+        Ranges minus unknowns: ``ranges.n_used - ranges.n_clocks - 1`` on the line, with ``- 3`` in space.
     scale : array_like, shape (T,) or ()
         Ratio of the receiver's range standard deviation to the sigmas of the weights. Not used in fixed mode.
     """
@@ -125,7 +125,7 @@ def detect(
 
 
 def threshold(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Floats:
-    """Return the threshold of the statistic for the given degrees of freedom, same shape; NaN below 1.
+    """Return the threshold of the test statistic for each number of degrees of freedom; NaN below 1.
 
     Example (P4): for a false-alarm rate of 0.001 and 3 degrees of freedom, T_CS = 16.27 and T_D = sqrt(T_CS) = 4.03.
     """
@@ -139,7 +139,7 @@ def threshold(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Floats
 
 @lru_cache(maxsize=64)
 def _chi_square_table(false_alarm: float, size: int) -> Floats:
-    """Return the chi-square thresholds for 0 to size - 1 degrees of freedom, NaN for 0."""
+    """Return the chi-square thresholds for 0 to size - 1 degrees of freedom; NaN for 0."""
     table = np.full(size, np.nan)
     table[1:] = scipy.special.chdtri(np.arange(1, size), false_alarm)
     table.flags.writeable = False
@@ -147,7 +147,7 @@ def _chi_square_table(false_alarm: float, size: int) -> Floats:
 
 
 _ROUNDING: Final = 1e-9  #: Relative difference within which two WSSE count as equal.
-#: Number of elements of the largest array for a block of epochs, so that it fits into the cache of a core.
+#: Largest number of elements of a block's array, so that the array fits into the cache of a core.
 _BLOCK_SIZE: Final = 40_000
 
 
@@ -173,42 +173,42 @@ class Exclusion:
     """Exclusions of T epochs by M channels."""
 
     outcome: Codes  #: `Outcome`, shape (T,).
-    excluded: Masks  #: True for excluded channels, only with the outcomes EXCLUDED_ONE and EXCLUDED_TWO; (T, M).
-    #: Channels of the passing subset with the smallest statistic, even if INSEPARABLE, shape (T, 2); -1 for none.
+    excluded: Masks  #: True for excluded channels, shape (T, M).
+    #: Passing subset with the smallest statistic, even if INSEPARABLE: channels, shape (T, 2); -1 for none.
     best: Indices
-    #: Channels of the closest competing exclusion, the next passing subset of as many channels, (T, 2); -1 for none.
+    #: Next passing subset of as many channels, the closest competing exclusion: shape (T, 2); -1 for none.
     alternative: Indices
-    #: Error of the channels of `best` relative to the others, positive if too long; NaN for the others; shape (T, M).
+    #: Range error of each channel of `best`, positive if the range is too long, shape (T, M); NaN for other channels.
     own_error_m: Floats
-    #: Statistic without the channels of `best`, shape (T,); the original statistic where no subset passes.
+    #: Test statistic without the channels of `best`, shape (T,), or of all channels where no subset passes.
     statistic_after: Floats
-    #: Position change when `best` is left out, shape (T, k): along the line (k = 1), or east and north (k = 2); 0 if no
-    #: subset passes.
+    #: Position change caused by leaving out `best`, shape (T, k); 0 where no subset passes. The components are along
+    #: the line (k = 1), or east and north (k = 2).
     position_change_m: Floats
     #: Distance between the positions without `best` and without `alternative`, shape (T,); NaN if either is missing.
     alternative_shift_m: Floats
-    detection: Detection  #: Detection before any exclusion.
+    detection: Detection  #: Fault detection before any exclusion.
 
 
 @dataclass(frozen=True)
 class _Trial:
-    """Results of leaving out each of the K subsets of one size, T epochs."""
+    """Results of leaving out each of K subsets of equal size at T epochs."""
 
     members: Indices  # (K, 1 or 2), indices in the compact arrays
-    statistic: Floats  # (T, K) of the remaining channels
+    statistic: Floats  # (T, K) test statistic of the remaining channels
     wsse_drop: Floats  # (T, K)
-    own: tuple[Floats, ...]  # (T, K) error of each member [sigma]
+    own: tuple[Floats, ...]  # (T, K) error of each member in sigmas
     allowed: Masks  # (T, K) all members are used, tested by other channels, and have errors above the limit
 
 
 def exclude(model: LinearModel, *, limits: RaimLimits | None = None, scale: ArrayLike = 1.0) -> Exclusion:
     """Detect faults, and exclude a single satellite or a pair from each faulty epoch.
 
-    A subset can be excluded if the remaining ranges pass with at least `min_redundancy` degrees of freedom, and if the
-    error of each satellite of the subset exceeds the noise (chi-square mode) or the square root of the limit (fixed
-    mode). Single satellites are preferred to pairs. Of several subsets, the subset with the smallest statistic is
-    excluded. The epoch is inseparable if another subset of the same size could also be excluded, and its statistic is
-    larger by no more than noise explains (`separation_risk`). `scale`, shape (T,) or (), is used as in `detect`.
+    A subset can be excluded if the remaining ranges pass with at least `min_redundancy` degrees of freedom. In
+    addition, the error of each excluded satellite must exceed the noise, or ``sqrt(fixed_limit_m2)`` in mode "fixed".
+    Single satellites are preferred to pairs. Of several subsets, the one with the smallest statistic is excluded. The
+    epoch is inseparable if another subset of equal size could also be excluded and noise can explain the difference
+    between the statistics (`separation_risk`). `scale` is the noise scale (see `detect`).
     """
     limits = limits or RaimLimits()
     epochs, channels = model.root_weight.shape
@@ -228,7 +228,7 @@ def exclude(model: LinearModel, *, limits: RaimLimits | None = None, scale: Arra
     failing = np.flatnonzero(detection.detected)
     result.outcome[failing] = Outcome.UNRESOLVED
     used = np.count_nonzero(model.used[failing], axis=1)
-    # Epochs are grouped by number of satellites, so that no block is wider than necessary.
+    # Epochs are sorted by number of satellites, so that block arrays are small.
     failing = failing[np.argsort(used, kind="stable")]
     widest = int(used.max(initial=1))
     size = max(1, _BLOCK_SIZE // (widest * widest))
@@ -306,7 +306,7 @@ def _pairs(parts: Compact, wsse: Floats, scale: Floats, limits: RaimLimits) -> _
 
 
 def _sum_squares(parts: Compact) -> tuple[Floats, Floats, Floats]:
-    """Return ``|V nu|^2``, ``S V^2 nu`` and ``S V^2 S`` with the sigmas V, for sums of squares [m^2] after exclusions.
+    """Return ``|V nu|^2``, ``S V^2 nu`` and ``S V^2 S`` with the sigmas V, for sums of squared residuals [m^2].
 
     The whitened residuals without the channels E are ``nu - S_E b_E``.
     """
@@ -319,7 +319,7 @@ def _sum_squares(parts: Compact) -> tuple[Floats, Floats, Floats]:
 def _choose(
     result: Exclusion, epochs: Indices, parts: Compact, trial: _Trial, after: Floats, scale: Floats, limits: RaimLimits
 ) -> None:
-    """Write the best passing subset of each epoch and the closest competing subset into `result`."""
+    """Write each epoch's best passing subset and closest competing subset into `result`."""
     passing = trial.allowed & (trial.statistic < after[:, None])
     rows = np.flatnonzero(passing.any(axis=1))
     if not len(rows):
@@ -354,7 +354,7 @@ def _choose(
 
 
 def _moves(parts: Compact, trial: _Trial, rows: Indices) -> Floats:
-    """Return the position change when each subset is left out, shape (rows, K, k) [m]."""
+    """Return the position change caused by leaving out each subset, shape (rows, K, k) [m]."""
     moves = np.zeros((len(rows), len(trial.members), parts.gain_m.shape[2]))
     for k, own in enumerate(trial.own):
         moves -= parts.gain_m[rows][:, trial.members[:, k]] * own[rows][..., None]
@@ -362,7 +362,7 @@ def _moves(parts: Compact, trial: _Trial, rows: Indices) -> Floats:
 
 
 def worst_channel(model: LinearModel) -> Indices:
-    """Return the channel whose removal reduces the WSSE most, shape (T,); 0 where no channel is tested by others."""
+    """Return the channel whose removal reduces the WSSE most, shape (T,); 0 if no range is tested."""
     share = model.redundancy
     checked = model.used & (share > LEAST_REDUNDANCY)
     drop = np.where(checked, model.residual**2 / np.where(checked, share, 1.0), 0.0)

@@ -1,10 +1,10 @@
 """Linear model of the ranges for RAIM, on the line and in space.
 
-P4 tests the residuals of ``y = H x + v``. Every range is divided by its sigma. The receiver clocks are eliminated, and
-so are the map errors across and up, which have a prior. The residual projector is ``S = I - R K R^T - B Q B^T``, where
-R has 1/sigma in the column of the satellite's clock, K is the covariance of the clocks at a known position, B is the
-design with the clocks eliminated, and Q is the covariance of the position. The residuals are ``nu = S y``, and ``WSSE =
-y^T S y`` is chi-square distributed with `LinearModel.freedom` degrees of freedom.
+P4 tests the residuals of ``y = H x + v``. Here, every range is divided by its sigma. The receiver clocks and the
+lateral and vertical map errors, which have a prior, are eliminated. The residual projector is ``S = I - R K R^T - B Q
+B^T``. R has 1/sigma in the column of the satellite's clock, K is the clock covariance at a known position, B is the
+design without the clocks, and Q is the position covariance. The residuals are ``nu = S y``, and ``WSSE = y^T S y`` is
+chi-square distributed with `LinearModel.freedom` degrees of freedom.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from railfix.positioning.range_arrays import Ranges
 
 
 class ModelArrays(NamedTuple):
-    """Arrays of `LinearModel` in C order, as arguments of compiled functions."""
+    """Arrays of `LinearModel` in C order, for compiled functions."""
 
     root_weight: Floats
     clock: Indices
@@ -34,7 +34,7 @@ class ModelArrays(NamedTuple):
     misfit: Floats
 
 
-#: Arrays of `LinearModel` whose first axis is the epoch.
+#: Arrays of `LinearModel` with epochs on the first axis.
 _BY_EPOCH: Final = ("root_weight", "clock_covariance_m2", "design", "covariance_m2", "misfit", "freedom")
 
 
@@ -42,33 +42,33 @@ _BY_EPOCH: Final = ("root_weight", "clock_covariance_m2", "design", "covariance_
 class LinearModel:
     """Whitened ranges of T epochs by M channels, linearised at a position.
 
-    The three unknowns of the position are along, across and up on the line, and east, north and up in space. The first
-    `interest` unknowns are the position components of interest.
+    The three position unknowns are along, across and up on the line, or east, north and up in space. The first
+    `interest` unknowns are the components of interest.
     """
 
     root_weight: Floats  #: 1/sigma of each range, shape (T, M) [1/m]; 0 for unused ranges.
-    clock: Indices  #: Receiver clock of each channel as an index into the groups of the ranges, shape (M,).
-    clock_covariance_m2: Floats  #: Covariance of the clocks at a known position (K), shape (T, G, G).
-    #: Derivative of the whitened range with respect to the position, with the clocks eliminated (B), shape (T, M, 3)
-    #: [1/m]; 0 for unused ranges.
+    clock: Indices  #: Index of each channel's receiver clock, shape (M,).
+    clock_covariance_m2: Floats  #: Clock covariance K at a known position, shape (T, G, G).
+    #: Design B: derivatives of the whitened ranges with respect to the position, with the clocks eliminated, shape (T,
+    #: M, 3) [1/m]; 0 for unused ranges.
     design: Floats
-    #: Covariance of the position, prior included (Q), shape (T, 3, 3); NaN where the position is undetermined.
+    #: Position covariance Q with the prior, shape (T, 3, 3); NaN where the position is undetermined.
     covariance_m2: Floats
-    prior: Floats  #: Prior information on the position, from the map sigmas across and up, shape (3, 3) [1/m^2].
-    #: Whitened code minus range at the position (y), except for the clock, shape (T, M); 0 for unused ranges.
+    prior: Floats  #: Prior information P on the position, from the map sigmas, shape (3, 3) [1/m^2].
+    #: Whitened code minus distance y, clocks not subtracted, shape (T, M); 0 for unused ranges.
     misfit: Floats
-    freedom: Integers  #: Degrees of freedom, the number of ranges minus unknowns, shape (T,); may be negative.
-    interest: int  #: Number of components of interest: 1 on the line, 2 (horizontal) in space.
+    freedom: Integers  #: Degrees of freedom: ranges minus unknowns, shape (T,); may be negative.
+    interest: int  #: Number of components of interest: 1 on the line, 2 in space (horizontal).
 
     def __len__(self) -> int:
         return len(self.root_weight)
 
     def take(self, epochs: Masks | Indices) -> LinearModel:
-        """Return the model of the epochs selected by a mask or by indices."""
+        """Return the model of selected epochs."""
         return replace(self, **{name: getattr(self, name)[epochs] for name in _BY_EPOCH})
 
     def patch(self, epochs: Indices, part: LinearModel) -> LinearModel:
-        """Return the model with the epochs at these indices replaced by the epochs of `part`."""
+        """Return the model after replacing `epochs` by the epochs of `part`."""
         if len(epochs) == len(self):
             return part
         changed = {}
@@ -79,7 +79,7 @@ class LinearModel:
 
     @cached_property
     def arrays(self) -> ModelArrays:
-        """Arrays of the model, without `freedom` and `interest`."""
+        """Arrays for compiled functions."""
         return ModelArrays(*(np.ascontiguousarray(getattr(self, name)) for name in ModelArrays._fields))
 
     @property
@@ -98,7 +98,7 @@ class LinearModel:
 
     @property
     def step_m(self) -> Floats:
-        """Best-fitting position relative to the position of linearisation, shape (T, 3) [m]; about 0 at a solution."""
+        """Best-fitting position minus linearisation position, shape (T, 3) [m]; near 0 at a solution."""
         return self._fitted[0]
 
     @property
@@ -108,7 +108,7 @@ class LinearModel:
 
     @property
     def redundancy(self) -> Floats:
-        """Redundancy numbers (diagonal of S), shape (T, M); 0 for unused ranges and ranges tested by no other range.
+        """Redundancy numbers (diagonal of S), shape (T, M); 0 for unused ranges and ranges that no other range tests.
 
         A redundancy number is the fraction of a range error that appears in the residual of the same range.
         """
@@ -116,12 +116,12 @@ class LinearModel:
 
     @cached_property
     def residual_m(self) -> Floats:
-        """Residuals of the fit with the map error estimated, shape (T, M) [m]; 0 for unused ranges."""
+        """Residuals of the fit in which the map error is estimated, shape (T, M) [m]; 0 for unused ranges."""
         return np.where(self.used, self.residual / np.where(self.used, self.root_weight, 1.0), 0.0)
 
     @cached_property
     def wsse(self) -> Floats:
-        """Weighted sum of squared residuals ``y^T S y``, map error and known clock offsets included, shape (T,)."""
+        """Weighted sum of squared residuals ``y^T S y``, including map error and known clock offsets, shape (T,)."""
         return np.asarray(np.einsum("tm,tm->t", self.misfit, self.residual))
 
     @cached_property
@@ -132,8 +132,8 @@ class LinearModel:
     def position_covariance_m2(self, scale: Floats) -> Floats:
         """Return the covariance of the components of interest, shape (T, interest, interest) [m^2].
 
-        `scale` multiplies the sigmas of the ranges and clock offsets, but not the map error. The part ``Q P Q`` of the
-        covariance Q is due to the prior P, and ``Q - Q P Q`` to the ranges.
+        `scale` multiplies the sigmas of ranges and clock offsets, but not of the map error. The map causes the part ``Q
+        P Q`` of the covariance Q, the ranges cause ``Q - Q P Q``.
         """
         k = self.interest
         covariance = self.covariance_m2
@@ -143,18 +143,18 @@ class LinearModel:
 
 @dataclass(frozen=True, kw_only=True)
 class Compact(RowArrays):
-    """Residuals and projector of T epochs by n channels, with the used channels of each epoch first."""
+    """Residuals and projector of T epochs and n channels. At each epoch, the used channels are first."""
 
-    channel: Indices  #: Channel of the model at each index, shape (T, n).
-    used: Masks  #: False beyond the used channels of an epoch, shape (T, n).
-    projector: Floats  #: Residual projector S, shape (T, n, n); 0 beyond the used channels.
+    channel: Indices  #: Channel of the model for each index, shape (T, n).
+    used: Masks  #: True for used channels, shape (T, n).
+    projector: Floats  #: Residual projector S, shape (T, n, n); 0 for unused channels.
     residual: Floats  #: Whitened residuals, shape (T, n).
-    sigma_m: Floats  #: Standard deviations of the ranges, shape (T, n); 0 beyond the used channels.
+    sigma_m: Floats  #: Standard deviations of the ranges, shape (T, n); 0 for unused channels.
     gain_m: Floats  #: `LinearModel.gain_m`, shape (T, n, interest).
 
 
 def compact(model: LinearModel) -> Compact:
-    """Return the residuals and the residual projector (T, n, n) of the used channels, in channel order."""
+    """Return residuals and residual projector of the used channels, in channel order."""
     n = int(model.used.sum(axis=1).max(initial=0))
     channel = np.argsort(~model.used, axis=1, kind="stable")[:, :n]
     used = np.take_along_axis(model.used, channel, axis=1)
@@ -174,7 +174,7 @@ def compact(model: LinearModel) -> Compact:
 
 
 def linear_model(ranges: Ranges, line: Line, arc_m: Floats, *, section: Indices | None = None) -> LinearModel:
-    """Linearise ranges at positions on the line, with the map error across and up as a prior (P1 2.2(3), P4).
+    """Linearise ranges at positions on the line, with a prior on lateral and vertical map errors (P1 2.2(3), P4).
 
     The prior uses `sigma_plan_m` and `sigma_height_m` of the trajectory. The model is NaN at epochs without a position.
 
@@ -184,9 +184,9 @@ def linear_model(ranges: Ranges, line: Line, arc_m: Floats, *, section: Indices 
         Returned by `railfix.positioning.weighted_ranges`.
     line : Trajectory, SearchIndex or AntennaRows
     arc_m : ndarray, shape (T,) [m]
-        Positions from these ranges (`Constrained.arc_m` of `railfix.positioning.position_on_line`).
+        Positions computed from `ranges` (`Constrained.arc_m` of `railfix.positioning.position_on_line`).
     section : ndarray of int, shape (T,), optional
-        Sections of the positions (`Constrained.section`), required where a position is at the joint of two sections.
+        Section of each position (`Constrained.section`). It is required for positions at the joint of two sections.
     """
     antennas = AntennaRows.on(line)
     at = antennas.segment_at(arc_m) if section is None else np.maximum(section, 0)
@@ -197,7 +197,7 @@ def linear_model(ranges: Ranges, line: Line, arc_m: Floats, *, section: Indices 
 def update_model(
     model: LinearModel, ranges: Ranges, antennas: AntennaRows, position: Constrained, epochs: Indices
 ) -> LinearModel:
-    """Return the model with `epochs`, in ascending order, recomputed from the given ranges and positions."""
+    """Return the model after recomputing `epochs` from new ranges and positions; `epochs` must be ascending."""
     for index, own in antennas.split(epochs):
         model = model.patch(
             own, linear_model(ranges.take(own), index, position.arc_m[own], section=position.section[own])
@@ -208,8 +208,7 @@ def update_model(
 def _model(ranges: Ranges, place_ecef_m: Floats, axes: Floats, prior: Floats, *, unknowns: int) -> LinearModel:
     """Whiten the ranges, eliminate the clocks, and invert the normal matrix.
 
-    `axes`, shape (T, 3, 3), are the unit vectors of the unknowns at the positions `place_ecef_m`, NaN without a
-    position; `prior`, shape (3, 3) [1/m^2], is `LinearModel.prior`.
+    `axes`, shape (T, 3, 3), are the unit vectors of the position unknowns at `place_ecef_m`; NaN without a position.
     """
     arrays = ranges.arrays
     root, clocks, design, covariance, misfit = kernels.model.linearise_ranges(
