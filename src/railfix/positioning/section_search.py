@@ -1,11 +1,11 @@
-"""Section search: the point of the trajectory that fits the ranges best.
+"""Section search: find the trajectory point that fits the ranges best.
 
-P1 2.2(2) compares between-satellite single differences of ranges and distances. The weighted sum of squares ``q`` of
-these differences equals the weighted sum of squared residuals after elimination of the constellations' clocks.
-`find_section` returns the point with the least ``q`` in a time that hardly depends on the length of the line. Where a
-3-D position exists, ``q`` increases from this position as a quadratic form, so only the points inside a ball are
-evaluated. Otherwise the search is coarse to fine. It relies on a bound: between two points, the root of ``q`` changes
-by at most the distance times the root of the summed weights. Both searches are exact.
+P1 2.2(2) compares between-satellite single differences of ranges with those of distances. The weighted sum of squares
+``q`` of these comparisons equals the weighted sum of squared residuals after elimination of the clocks. `find_section`
+finds the point with the least ``q`` in a time that hardly depends on the length of the line. If a 3-D position exists,
+``q`` increases from this position as a quadratic form, so that only points inside a ball are evaluated. Otherwise, the
+search is coarse to fine. It uses a bound: between two points, the root of ``q`` changes by at most the distance times
+the root of the summed weights. Both searches are exact.
 """
 
 from __future__ import annotations
@@ -27,82 +27,83 @@ from railfix.positioning.normal_equations import SinglePoint, misfit, normal_equ
 from railfix.positioning.range_arrays import Ranges
 from railfix.positioning.search_index import SearchIndex
 
-#: Alternative positions are searched for up to an excess of q that noise exceeds with this probability. This excess is
-#: larger than the limit of ambiguity, because a fault of one range can increase the excess of the true position.
+#: Probability that noise exceeds the excess of q up to which alternative positions are searched for. This excess is
+#: larger than the ambiguity threshold, because a range fault can increase q at the true position.
 _REACH_RISK: Final = 1e-16
 
 
 class SectionLimits(Settings):
-    """Limits of ambiguous sections."""
+    """Limits for ambiguous sections."""
 
     #: Probability that noise makes the true position fit worse than the best position by more than the threshold
     #: (chi-square, one degree of freedom). P1 3.2 describes wrong sections on sharp curves.
     ambiguity_risk: float = Field(default=1e-3, gt=0, lt=1)
-    separation_m: float = Field(default=30.0, ge=0)  #: Least distance along the line between two distinct positions.
-    #: Number of redundant ranges below which a section is doubtful. On recordings with two constellations, a quarter of
-    #: the sections were wrong with one redundant range, and 3 to 4 % with two.
+    separation_m: float = Field(default=30.0, ge=0)  #: Minimum distance along the line of an alternative position.
+    #: Minimum number of redundant ranges of a reliable section. On recordings with two constellations, a quarter of the
+    #: sections were wrong with one redundant range, but 3 to 4 % with two.
     redundancy: int = Field(default=2, ge=0)
 
     @cached_property
     def threshold(self) -> float:
-        """Largest excess of q within noise of unit variance."""
+        """Largest excess of q of an ambiguous section, for noise of unit variance."""
         return float(scipy.special.chdtri(1, self.ambiguity_risk))
 
     @cached_property
     def reach(self) -> float:
-        """Excess of q up to which alternative positions are searched for."""
+        """Largest excess of q of an alternative position, for noise of unit variance."""
         return float(scipy.special.chdtri(1, min(_REACH_RISK, self.ambiguity_risk)))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Section:
-    """Best-fitting point of the trajectory, T epochs."""
+    """Best-fitting trajectory points, T epochs."""
 
-    #: Index of the point with the least q, shape (T,); -1 where the ranges do not outnumber the clocks.
+    #: Index of the point with the least q, shape (T,); -1 where there are no more ranges than clocks.
     vertex: Indices
-    q: Floats  #: Weighted sum of squared residuals at `vertex`; NaN without a point; shape (T,).
-    #: q at the best alternative position minus q at the best position, both interpolated between the points of the
-    #: trajectory, divided by the variance factor of the best fit (at least 1). Negative where the alternative fits
-    #: better; infinite without an alternative; shape (T,).
+    q: Floats  #: Weighted sum of squared residuals at `vertex`, shape (T,); NaN without a point.
+    #: Excess of q at the best alternative position over q at the best position, divided by the variance factor of the
+    #: best fit (at least 1), shape (T,); infinite without an alternative. Because both values of q are interpolated
+    #: between points, the excess can be negative.
     excess: Floats
-    other_vertex: Indices  #: Point of the alternative position; -1 if there is none; shape (T,).
+    other_vertex: Indices  #: Point nearest to the alternative position, shape (T,); -1 if none.
     evaluations: Integers  #: Number of points at which q was computed, shape (T,).
 
 
 class SectionCandidates(NamedTuple):
-    """Evaluated points of n epochs, sorted by epoch and point; p points in total."""
+    """Evaluated points of n epochs, p points in total, sorted by epoch and point."""
 
     at: Indices  #: Epochs, shape (n,).
-    points: Indices  #: Number of points of each epoch, at least 1; shape (n,).
-    vertex: Indices  #: Index of each point in the trajectory, shape (p,).
+    points: Indices  #: Number of points of each epoch, at least 1, shape (n,).
+    vertex: Indices  #: Trajectory index of each point, shape (p,).
     q: Floats  #: Weighted sum of squares at each point, shape (p,).
     half_gradient: Floats  #: Half the gradient of `q` at each point, shape (p, 3).
     matrix: Floats  #: Normal matrices, shape (m, 3, 3).
-    matrix_of: Indices  #: Index of the normal matrix of each point, shape (p,).
+    matrix_of: Indices  #: Index of each point's normal matrix, shape (p,).
 
 
 def find_section(ranges: Ranges, line: Line, point: SinglePoint, *, limits: SectionLimits | None = None) -> Section:
-    """Return the point of the line that the ranges fit best, by between-satellite single differences (P1 2.2(2)).
+    """Find the point of the line that fits the ranges best, by between-satellite single differences (P1 2.2(2)).
 
-    With full covariances the single differences of the residuals ``v_i = P_i - |s_i - r|`` at a point r have the
-    weighted sum of squares ``q = sum_i w_i (v_i - mean)^2``, with weighted means over the satellites of a clock.
+    At a point r, the residuals are ``v_i = P_i - |s_i - r|``. Their single differences, with full covariances, have the
+    weighted sum of squares ``q = sum_i w_i (v_i - mean)^2``. The mean is the weighted mean over the satellites of a
+    clock.
 
     Parameters
     ----------
     ranges : Ranges
         Returned by `weighted_ranges`.
     line : Trajectory, SearchIndex or AntennaRows
-        Trajectory of the antenna; an index made once (`SearchIndex(trajectory)`) saves time in repeated calls.
+        Trajectory of the antenna. A `SearchIndex(trajectory)` that is built once saves time in repeated calls.
     point : SinglePoint
-        3-D positions from the same ranges (`point_position`), NaN where missing. These positions shorten the search,
-        but do not change the result.
+        3-D positions from the same ranges (`point_position`), NaN where missing. They shorten the search, but do not
+        change the result.
     limits : SectionLimits, optional
         Limits of ambiguous sections (P1 3.2).
 
     Returns
     -------
     Section
-        The vertex is -1 where there are no more ranges than clocks.
+        Best-fitting points.
     """
     limits, antennas = limits or SectionLimits(), AntennaRows.on(line)
     epochs = len(ranges)
@@ -143,9 +144,7 @@ def _ball(
     epochs: Indices,
     limits: SectionLimits,
 ) -> Floats:
-    """Return the radius of the sphere around each 3-D position that contains all candidate points [m]; NaN where
-    unknown.
-    """
+    """Return the radius of a ball around each 3-D position that contains all candidate points [m]; NaN if unknown."""
     radius = np.full(len(epochs), np.nan)
     known = np.isfinite(point.ecef_m[epochs, 0])
     at = epochs[known]
@@ -163,7 +162,7 @@ def _ball(
 def _in_ball(
     ranges: Ranges, index: SearchIndex, point: SinglePoint, weight_norm: Floats, epochs: Indices, radius: Floats
 ) -> SectionCandidates:
-    """Return the points in each epoch's ball; q is recomputed if the quadratic form cannot decide on the best point."""
+    """Return the points in each epoch's ball, with q recomputed where the quadratic form is not accurate enough."""
     count, vertex, q, half_gradient, unsure = kernels.search.points_in_balls(
         index.trajectory.ecef_m, index.stretches, point.ecef_m[epochs], radius, point.matrix[epochs],
         point.wsse[epochs], weight_norm[epochs],
@@ -179,9 +178,9 @@ def _in_ball(
 def _coarse_to_fine(
     ranges: Ranges, index: SearchIndex, weight_norm: Floats, freedom: Integers, limits: SectionLimits, epochs: Indices
 ) -> tuple[SectionCandidates, Integers]:
-    """Return the points that may agree within the noise, and the number of points evaluated at each epoch.
+    """Return the candidate points, and the number of points evaluated at each epoch.
 
-    Stretches of the line on which no point can agree within the noise are skipped.
+    Stretches of the line without a point that can fit within the noise are skipped.
     """
     points = index.trajectory.ecef_m
     upper = np.full(len(ranges), np.inf)

@@ -1,9 +1,9 @@
-"""Likelihood of the carrier phases of a train at rest and of a base station, for a position and its covariance.
+"""Likelihood of a position at standstill, from double-differenced carrier phases of the train and a base station.
 
-Double differences have integer ambiguities that are constant while the train is at rest. Along a track, there are
-integers that fit the phases of all satellites only near the true position (P1 2.5). Each satellite's phase has a
-constant error, which does not average out. Integers are found by LAMBDA: decorrelation and a search in a shrinking
-ellipsoid (Teunissen 1995, doi:10.1007/BF00863419; Chang, Yang & Zhou 2005, doi:10.1007/s00190-005-0004-x).
+The double differences have integer ambiguities that are constant at standstill. Along a track, integers fit the phases
+of all satellites only near the true position (P1 2.5). Each satellite's phase has a constant error, which does not
+average out. The integers are found by LAMBDA: decorrelation and a search in a shrinking ellipsoid (Teunissen 1995,
+doi:10.1007/BF00863419; Chang, Yang & Zhou 2005, doi:10.1007/s00190-005-0004-x).
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ import scipy
 
 from railfix.core.arrays import Floats, Integers
 
-#: Vectors whose weighted square exceeds the least one by more than this are omitted; their likelihood relative to the
-#: best vector is below exp(-20).
+#: Integer vectors whose weighted square exceeds the least by more than this value are omitted. Their likelihood
+#: relative to the best vector is below exp(-20).
 _WITHIN: Final = 40.0
-_ROUNDING: Final = 1e-9  #: Two unknowns are exchanged if this lowers a conditional variance by more than this fraction.
+_ROUNDING: Final = 1e-9  #: Smallest relative decrease of a conditional variance by an exchange.
 
 
 class IntegerSearch:
-    """Search for integer vectors near real vectors with a positive definite covariance, shape (n, n) [cycle^2]."""
+    """Search for integer vectors near real vectors with a covariance of shape (n, n) [cycle^2]."""
 
     def __init__(self, covariance: Floats) -> None:
         # unit lower triangular L and variances d with covariance = L' diag(d) L
@@ -35,9 +35,9 @@ class IntegerSearch:
         self._back = np.round(np.linalg.inv(self._transform)).astype(np.int64)
 
     def nearest(self, cycles: Floats, count: int, *, below: float = np.inf) -> tuple[Integers, Floats]:
-        """Return at most `count` integer vectors (m, n), nearest first, and their squares ``(N - c)' inv(Q) (N - c)``.
+        """Return up to `count` integer vectors N, nearest first, and their squares ``(N - c)' inv(Q) (N - c)``.
 
-        Vectors with a square of `below` or more are omitted.
+        Vectors with squares of `below` or more are omitted. Shapes are (m, n) and (m,).
         """
         integers, squares = _search(cycles @ self._transform, self._lower, self._variance, count, below)
         return integers @ self._back, squares
@@ -66,7 +66,7 @@ def _decorrelate(lower: Floats, variance: Floats) -> tuple[Integers, Floats, Flo
 
 
 def _exchange(lower: Floats, variance: Floats, transform: Integers, k: int, new: float) -> None:
-    """Exchange unknowns k and k + 1 in place; `new` is the conditional variance of k + 1 after the exchange."""
+    """Exchange the unknowns k and k + 1 in place; `new` is the conditional variance of k + 1 after the exchange."""
     share, slope = variance[k] / new, variance[k + 1] * lower[k + 1, k] / new
     variance[k], variance[k + 1] = share * variance[k + 1], new
     above, below = lower[k, :k].copy(), lower[k + 1, :k].copy()
@@ -78,7 +78,7 @@ def _exchange(lower: Floats, variance: Floats, transform: Integers, k: int, new:
 
 
 def _search(cycles: Floats, lower: Floats, variance: Floats, count: int, below: float) -> tuple[Integers, Floats]:
-    """Return the nearest integer vectors of decorrelated unknowns, by a depth-first search from the last unknown."""
+    """Return the nearest integer vectors of decorrelated unknowns, found by depth-first search."""
     n = len(variance)
     # Python floats are faster here than arrays of one element
     start, weight = cycles.tolist(), (1.0 / variance).tolist()
@@ -116,25 +116,25 @@ def _search(cycles: Floats, lower: Floats, variance: Floats, count: int, below: 
     return integers, np.array([square for square, _ in kept])
 
 
-#: Largest number of integer vectors whose likelihoods are added.
+#: Largest number of integer vectors in a likelihood.
 _VECTORS: Final = 20
-#: A vector is left out if its log likelihood, minus the log likelihood of uniform phases, is below this.
+#: Integer vectors are omitted if their log likelihood minus that of uniform phases is below this value.
 _NEGLIGIBLE: Final = -5.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class MeanPhases:
-    """Mean double differences of one antenna's carrier phases, n pairs of satellites."""
+    """Mean double differences of one antenna's carrier phases, for n satellite pairs."""
 
-    difference_m: Floats  #: Observed minus computed value at the origin, up to multiples of the wavelength; shape (n,).
-    away: Floats  #: Derivative of the double difference by position east, north and up; shape (n, 3).
-    wavelength_m: Floats  #: Wavelength of the carrier of each pair, shape (n,).
+    difference_m: Floats  #: Observed minus computed at the origin, modulo the wavelength, shape (n,).
+    away: Floats  #: Derivatives with respect to the position east, north and up, shape (n, 3).
+    wavelength_m: Floats  #: Carrier wavelength of each pair, shape (n,).
     covariance_m2: Floats  #: Covariance of `difference_m`, shape (n, n).
 
 
 @dataclass(frozen=True, kw_only=True)
 class CodePlace:
-    """Code position of one antenna, shape (3,) east, north and up of the origin [m], and its covariance."""
+    """Code position of one antenna, east, north and up of the origin, shape (3,) [m], and its covariance."""
 
     place_m: Floats
     covariance_m2: Floats
@@ -148,11 +148,11 @@ def phase_log_likelihood(
     *,
     fault_prior: float,
 ) -> Floats:
-    """Return the log density of the phases of A antennas, given their codes, for U hypotheses of position, shape (U,).
+    """Return the log likelihood of U position hypotheses from the phases of A antennas, given their codes, shape (U,).
 
-    A hypothesis has the mean `expected_m` (U, 3 A) and the covariance `prior_m2`. Phases are known modulo the
-    wavelength. With the probability `fault_prior`, the phases do not follow the model (slip, half cycle), and are
-    uniformly distributed over the wavelength.
+    A hypothesis is a position with the mean `expected_m`, shape (U, 3 A), and the covariance `prior_m2`. With the
+    probability `fault_prior`, the phases do not follow the model (slip, half cycle) and are uniformly distributed over
+    the wavelength.
     """
     measured = np.concatenate([code.place_m for code in codes])
     of_codes = scipy.linalg.block_diag(*(code.covariance_m2 for code in codes))
@@ -172,5 +172,5 @@ def phase_log_likelihood(
 
 
 def uniform_log_likelihood(phases: Sequence[MeanPhases], *, fault_prior: float) -> float:
-    """Return the log density of phases that do not follow the model, a lower bound of `phase_log_likelihood`."""
+    """Return the log likelihood of phases that do not follow the model, a lower bound of `phase_log_likelihood`."""
     return float(np.log(fault_prior) - sum(np.log(phase.wavelength_m).sum() for phase in phases))

@@ -1,11 +1,11 @@
-"""Track of a train at rest, from codes and carrier phases (P1 2.5).
+"""Track selection at standstill from codes and carrier phases (P1 2.5).
 
-A hypothesis is a track and the facing of the train; *none* is a parallel track that is missing from the map. At rest
-each satellite's code has a constant bias, so the covariance of the mean does not fall with the number of epochs. The
-posterior probability of a hypothesis is proportional to its prior times the likelihood integrated along the track. A
-track is selected when the posterior probability of all other tracks together is below the allowed risk. If the error
-model holds, this also bounds the probability of a wrong decision (a posterior is a martingale; Baum & Veeravalli 1994,
-doi:10.1109/18.340472).
+A hypothesis is a track together with the direction in which the train faces. The track *none* stands for a parallel
+track that is missing from the map. At standstill, each satellite's code has a constant bias, so that the covariance of
+the mean does not decrease with the number of epochs. The posterior probability of a hypothesis is proportional to its
+prior times the likelihood integrated along the track. A track is selected when the total posterior probability of all
+other tracks is below the allowed risk. If the error model is correct, this also bounds the probability of a wrong
+decision (a posterior is a martingale; Baum & Veeravalli 1994, doi:10.1109/18.340472).
 """
 
 from __future__ import annotations
@@ -24,53 +24,54 @@ from railfix.core.settings import Settings
 from railfix.positioning.standstill_phase import CodePlace, MeanPhases, phase_log_likelihood, uniform_log_likelihood
 from railfix.track.network import ANTENNA_SIGMA_M, ANTENNA_UP_M, CLEARANCE_M, UNMAPPED_PRIOR
 
-#: Step of the integral along the track [m].
+#: Integration step along the track [m].
 _ALONG_M: Final = 0.25
-#: Step of the integral across the track [m].
+#: Integration step across the track [m].
 _ACROSS_M: Final = 0.3
-#: Weight of an unmapped track within the clearance of a mapped track (possible only if the map is displaced), relative
-#: to an unmapped track farther away.
+#: Relative weight of an unmapped track within the clearance of a mapped track, which is possible only if the map is
+#: displaced. An unmapped track farther away has the weight 1.
 _BETWEEN_SHARE: Final = 0.1
-#: An unmapped track nearer than this to a mapped track has no weight [m].
+#: Minimum distance of an unmapped track from a mapped track [m].
 _BETWEEN_M: Final = 1.2
-#: No decision is made if the code position is farther from the most probable track than this [sigma].
+#: No track is selected if the code position is more than this number of sigmas from the most probable track.
 _LARGEST_MISFIT: Final = 4.0
-#: Length of track before and behind the code position over which the likelihood is integrated [m].
+#: The likelihood is integrated up to this distance before and behind the code position [m].
 _REACH_M: Final = 40.0
-_LEAST_ELEVATION_DEG: Final = 10.0  #: Errors at lower elevations are set to the errors at this elevation.
-#: Residual atmospheric error of the phase difference of two receivers, as a fraction of their distance.
+_LEAST_ELEVATION_DEG: Final = 10.0  #: Errors at lower elevations are those at this elevation.
+#: Residual atmospheric error of the phase difference of two receivers, as a fraction of the distance between them.
 _PHASE_SHARE: Final = 1e-6
-#: Phases are evaluated for hypotheses whose log likelihood from the codes is at most this much below the largest.
+#: Phases are not evaluated for hypotheses whose log likelihood from codes is farther below the largest than this.
 _UNLIKELY: Final = 25.0
-#: Standard deviation assumed for the position along the track, and for the height, in the phase search [m].
+#: Standard deviation assumed in the phase search for the position along the track and for the height [m].
 _ANY_PLACE_M: Final = 50.0
-#: Significance level at which the misfit of the mean codes rejects the error model.
+#: Significance level of the chi-square test of the code residuals.
 _MISFIT: Final = 1e-4
 NONE: Final = "none"
 _FREEDOM: Final = 8.0  #: Degrees of freedom of the Student's t distribution of height errors.
-#: Probability that the phases of a standstill do not follow the model, because of an undetected slip or half cycle.
+#: Probability that an undetected slip or half cycle affects the phases of a standstill.
 _PHASE_FAULT_PRIOR: Final = 1e-3
-_UNMAPPED_WIDTH_M: Final = 60.0  #: Width of the strip in which a missing track can lie.
+_UNMAPPED_WIDTH_M: Final = 60.0  #: Width of the strip that may contain a missing track.
 
 
 class StandstillErrors(Settings):
     """Standard deviations of code and phase errors at rest, and prior probability of an unmapped track."""
 
-    #: Constant code error of a satellite at the zenith (multipath); divided by the sine of the elevation.
+    #: Standard deviation of a satellite's constant code error (multipath) at the zenith. It is divided by the sine of
+    #: the elevation.
     code_bias_m: float = option("Constant code error of a satellite at the zenith.", 0.6, metavar="M", gt=0)
-    #: Varying code error at the zenith, correlated over `correlation_s`; divided by the sine of the elevation.
+    #: Standard deviation of a satellite's varying code error at the zenith. It is divided by the sine of the elevation.
     code_noise_m: float = option("Varying code error of a satellite at the zenith.", 0.5, metavar="M", gt=0)
 
     correlation_s: float = option("Correlation time of the varying code error.", 60.0, metavar="S", gt=0)
-    #: Constant carrier-phase error of a satellite at the zenith; divided by the sine of the elevation.
+    #: Standard deviation of a satellite's constant phase error at the zenith. It is divided by the sine of the
+    #: elevation.
     phase_bias_m: float = option("Constant phase error of a satellite at the zenith.", 0.005, metavar="M", gt=0)
-    #: Error of each antenna's position on the train, along and across: antenna spacing, sway and lean.
+    #: Standard deviation of each antenna's position on the train (antenna spacing, sway and lean), along and across.
     antenna_sigma_m: float = Field(default=0.05, gt=0)
-    #: Map error across the track common to all tracks of a yard, including the shift of the antenna on canted track.
+    #: Standard deviation of the lateral map error common to all tracks of a yard, including antenna shifts due to cant.
     map_sigma_m: float = option("Error of the map across the track, common to all its tracks.", 0.3, metavar="M", ge=0)
 
-    #: If None, `ANTENNA_UP_M` is used with the standard deviation `ANTENNA_SIGMA_M`, which covers usual vehicle
-    #: heights.
+    #: If None, the height is `ANTENNA_UP_M`, with the standard deviation `ANTENNA_SIGMA_M` for usual vehicle heights.
     antenna_up_m: float | None = option(
         "Height of the antennas above the rails, for tracks above each other; by default about 2.5 m.",
         None,
@@ -88,13 +89,13 @@ class StandstillErrors(Settings):
         return np.asarray(self.code_bias_m / _sine(elevation_deg))
 
     def phase_sigma_m(self, elevation_deg: Floats, *, distance_m: float) -> Floats:
-        """Return the standard deviation of the difference of two receivers' phases, with atmospheric error [m]."""
+        """Return the standard deviation of the phase difference of two receivers [m], including atmospheric errors."""
         return np.asarray(np.hypot(np.sqrt(2.0) * self.phase_bias_m, _PHASE_SHARE * distance_m) / _sine(elevation_deg))
 
     def mean_noise_m(self, elevation_deg: Floats, seconds: float) -> Floats:
-        """Return the standard deviation of the mean of the varying code error over a time [m].
+        """Return the standard deviation of the varying code error, averaged over a time T of `seconds` [m].
 
-        The variance of the mean of a Gauss-Markov process is 2 tau/T (1 - tau/T (1 - exp(-T/tau))) times its variance.
+        Averaging a Gauss-Markov process multiplies its variance by 2 tau/T (1 - tau/T (1 - exp(-T/tau))).
         """
         ratio = self.correlation_s / max(seconds, 1e-9)
         share = 2.0 * ratio * (1.0 - ratio * (1.0 - np.exp(-1.0 / ratio)))
@@ -107,18 +108,18 @@ def _sine(elevation_deg: Floats) -> Floats:
 
 @dataclass(frozen=True, kw_only=True)
 class StandstillFix:
-    """Mean position of one antenna at rest."""
+    """Mean position of one antenna at standstill."""
 
-    east_north_m: Floats  #: Position east and north of the origin of the yard's coordinates, shape (2,).
-    own_m2: Floats  #: Covariance of this antenna's own errors: code bias and noise; shape (2, 2).
-    common_m2: Floats  #: Covariance of satellite and atmospheric errors, common to both antennas; shape (2, 2).
-    misfit: float  #: Weighted sum of squares of the residuals.
+    east_north_m: Floats  #: Position east and north of the yard's origin, shape (2,).
+    own_m2: Floats  #: Covariance due to code bias and noise of this antenna, shape (2, 2).
+    common_m2: Floats  #: Covariance due to satellite and atmospheric errors, common to all antennas, shape (2, 2).
+    misfit: float  #: Weighted sum of squared residuals.
     freedom: int  #: Degrees of freedom of `misfit`.
-    place: CodePlace | None = None  #: Position with height, for phases; None where there are no phases.
+    place: CodePlace | None = None  #: Position with height.
 
     @property
     def fits(self) -> bool:
-        """Whether the residuals agree with the error model."""
+        """True if the residuals agree with the error model."""
         return self.freedom < 1 or bool(scipy.special.chdtrc(self.freedom, self.misfit) > _MISFIT)
 
 
@@ -133,11 +134,11 @@ def standstill_fix(
     errors: StandstillErrors,
     receivers: int = 1,
 ) -> StandstillFix | None:
-    """Estimate the position of an antenna at rest from mean code residuals; None if it is not determined.
+    """Estimate an antenna position at standstill from mean code residuals; return None if it is undetermined.
 
-    Arrays have shape (K,): `system` has clock letters; `residual_m` has means over `seconds` of observed minus computed
-    codes at the origin; `common_m` has the sigmas of satellite and atmospheric errors. `receivers` is 2 if the codes of
-    a base station are subtracted.
+    All arrays have the shape (K,). `system` has clock letters. `residual_m` has observed minus computed codes at the
+    origin, averaged over `seconds`. `common_m` has the sigmas of satellite and atmospheric errors. `receivers` is 2 if
+    the codes of a base station are subtracted.
     """
     letters = np.unique(system)
     azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
@@ -169,30 +170,28 @@ def standstill_fix(
 
 @dataclass(frozen=True, kw_only=True)
 class YardTrack:
-    """A track near the train: name, and points east and north of the origin, shape (n, 2) [m], in the track's
-    direction.
-    """
+    """Name and points of a track near the train; points are east and north of the origin, shape (n, 2) [m]."""
 
     name: str
     points_m: Floats
-    up_m: float = np.nan  #: Height above the origin where the track is nearest to it; NaN if unknown.
+    up_m: float = np.nan  #: Height of the track near the origin, above the origin; NaN if unknown.
     sigma_up_m: float = 0.0  #: Standard deviation of `up_m`.
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrackPosterior:
-    """Posterior probability of each track, and its agreement with the codes."""
+    """Posterior probability of each track, and agreement of each track with the codes."""
 
-    names: tuple[str, ...]  #: Names of the tracks, then `NONE`.
-    probability: Floats  #: Posterior probability of each of `names`, shape (tracks + 1,).
+    names: tuple[str, ...]  #: Names of all tracks, followed by `NONE`.
+    probability: Floats  #: Posterior probability for each name, shape (tracks + 1,).
     #: Probability that the train is on the track and faces in the track's direction, shape (tracks,).
     with_rising: Floats
-    fits: bool  #: Whether the codes agree with the error model.
-    #: Distance of the code position from each track, in standard deviations; shape (tracks + 1,), NaN for `NONE`.
+    fits: bool  #: True if the codes agree with the error model.
+    #: Distance of the code position from each track in standard deviations, shape (tracks + 1,); NaN for `NONE`.
     misfit_sigmas: Floats
 
     def decision(self, *, risk: float) -> str:
-        """Return the track (or `NONE`) with a probability above one minus the risk; empty if no track is selected."""
+        """Return the track (or `NONE`) whose probability exceeds one minus `risk`; empty if no track is selected."""
         best = int(np.argmax(self.probability))
         if not self.fits or self.misfit_sigmas[best] > _LARGEST_MISFIT:
             return ""
@@ -210,9 +209,9 @@ def track_posterior(
 ) -> TrackPosterior:
     """Compute the probability that a train at rest is on each track, or on none.
 
-    `arms_m` is the position of each antenna along the train, positive to its front. `prior` has the weights of tracks
-    by name; a track that is not named has the weight 0, and a ValueError is raised if all weights are 0. `phases` has
-    one item per antenna, and is empty without a base station.
+    `arms_m` are the positions of the antennas along the train, positive towards its front. `prior` has the weight of
+    each track, 0 for tracks without an entry. Raise ValueError if all weights are 0. `phases` has one item per antenna;
+    it is empty without a base station.
     """
     covariance = _covariance(fixes, errors, tracks)
     places = np.concatenate([fix.east_north_m for fix in fixes])
@@ -226,7 +225,7 @@ def track_posterior(
     width = len(shifts)
     likely = _shift_weights(shifts, tracks, nearest, fixes[0].east_north_m)
     shifts, likely = shifts[likely > 0.0], likely[likely > 0.0]
-    # hypotheses: each track, and shifts of the nearest track, with both facings
+    # hypotheses: each track, and laterally shifted copies of the nearest track, each with both facings
     lines = [*((track, np.zeros(1)) for track in tracks), (tracks[nearest], shifts)]
     found = [
         [_places(track.points_m, places, covariance, arms_m, facing, across) for facing in (1.0, -1.0)]
@@ -263,10 +262,10 @@ def track_posterior(
 
 
 def _height_likelihood(tracks: Sequence[YardTrack], fixes: Sequence[StandstillFix], errors: StandstillErrors) -> Floats:
-    """Return the log likelihood of the height from codes, for each track and for `NONE`, shape (tracks + 1,).
+    """Return the log likelihood of each track and of `NONE` from the code height, shape (tracks + 1,).
 
-    Student's t distribution limits the effect of a height that agrees with no track. Tracks of unknown height, and
-    `NONE`, get the largest likelihood of the tracks with a known height.
+    Student's t distribution limits the effect of a height that agrees with no track. For `NONE` and tracks of unknown
+    height, the largest likelihood of the other tracks is used.
     """
     codes = [fix.place for fix in fixes if fix.place is not None]
     up = np.array([track.up_m for track in tracks])
@@ -285,7 +284,7 @@ def _height_likelihood(tracks: Sequence[YardTrack], fixes: Sequence[StandstillFi
 def _with_phases(
     found: list[list[_Places]], fixes: Sequence[StandstillFix], phases: Sequence[MeanPhases], errors: StandstillErrors
 ) -> list[list[_Places]]:
-    """Return the hypotheses with the log likelihood of the phases added to their evidence."""
+    """Return the hypotheses after adding the log likelihood from the phases."""
     codes = [fix.place for fix in fixes if fix.place is not None]
     heights = np.array([code.place_m[2] for code in codes])
     best = max(item.log_evidence.max(initial=-np.inf) for row in found for item in row)
@@ -315,7 +314,7 @@ def _with_phases(
 
 
 def _spread(heading: Floats, errors: StandstillErrors) -> Floats:
-    """Return the covariance of antenna positions, (3 A, 3 A), with common along-track and map errors."""
+    """Return the covariance of A antenna positions, shape (3 A, 3 A), with common along-track and map errors."""
     count = len(heading)
     along = np.column_stack([heading, np.zeros(count)])
     right = np.column_stack([heading[:, 1], -heading[:, 0], np.zeros(count)])
@@ -325,7 +324,7 @@ def _spread(heading: Floats, errors: StandstillErrors) -> Floats:
 
 
 def _covariance(fixes: Sequence[StandstillFix], errors: StandstillErrors, tracks: Sequence[YardTrack]) -> Floats:
-    """Return the covariance of all positions, shape (2 A, 2 A); common and map errors are equal for all antennas."""
+    """Return the covariance of A code positions, shape (2 A, 2 A), with common `common_m2` and map errors."""
     nearest = min(tracks, key=lambda track: _distance(track.points_m, fixes[0].east_north_m))
     step = np.diff(nearest.points_m, axis=0)
     middle = nearest.points_m[:-1] + step / 2.0
@@ -339,7 +338,7 @@ def _covariance(fixes: Sequence[StandstillFix], errors: StandstillErrors, tracks
 
 
 def _shift_weights(shifts_m: Floats, tracks: Sequence[YardTrack], nearest: int, place_m: Floats) -> Floats:
-    """Return the weight of each shift of the nearest track: 1 far from tracks, smaller between tracks, 0 on a track."""
+    """Return the weight of each lateral shift: 1 far from all tracks, smaller near a track, 0 on a track."""
     points = tracks[nearest].points_m
     start, step = points[:-1], np.diff(points, axis=0)
     share = np.clip(((place_m - start) * step).sum(axis=1) / (step**2).sum(axis=1), 0.0, 1.0)
@@ -365,18 +364,18 @@ def _distances(points_m: Floats, places_m: Floats) -> Floats:
 
 @dataclass(frozen=True, kw_only=True)
 class _Places:
-    """Hypotheses for one track and one facing, at U shifts across the track."""
+    """Hypotheses for one track and one facing, with U lateral shifts."""
 
-    log_evidence: Floats  #: Likelihood integrated over the position along the track, shape (U,).
+    log_evidence: Floats  #: Logarithm of the likelihood integrated along the track, shape (U,).
     expected_m: Floats  #: Most likely positions of the antennas, shape (U, A, 2).
     heading: Floats  #: Unit vectors along the track at the antennas, shape (A, 2).
-    misfit: float = np.inf  #: Least distance of the code positions from the hypotheses, in standard deviations.
+    misfit: float = np.inf  #: Distance of the code positions from the track, in sigmas.
 
 
 def _places(
     points_m: Floats, places_m: Floats, covariance: Floats, arms_m: Sequence[float], facing: float, shifts_m: Floats
 ) -> _Places:
-    """Return the hypotheses for a track at shifts across it; empty if the antennas are beyond the ends of the track."""
+    """Return the hypotheses for a track and lateral shifts; empty if the antennas are beyond the ends of the track."""
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points_m, axis=0), axis=1))])
     dense = np.linspace(0.0, way[-1], max(2, int(np.ceil(way[-1] / 5.0)) + 1))
     line = np.stack([np.interp(dense, way, points_m[:, i]) for i in (0, 1)], axis=-1)

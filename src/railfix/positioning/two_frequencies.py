@@ -1,14 +1,15 @@
-"""Combination of a satellite's two codes into one pseudorange, with an estimate of the ionospheric delay.
+"""Combination of the codes on two frequencies into one pseudorange per satellite, with an ionospheric estimate.
 
-The difference of the two corrected codes of a satellite does not depend on the geometry. With ``ratio = (f1/f2)^2``,
+The difference between the two corrected codes of a satellite does not depend on the geometry. With ``ratio =
+(f1/f2)^2``,
 
     ``P2 - P1 = B + (ratio - 1) I + e2 - e1``
 
-where I is the error of the modelled ionosphere on the first frequency, and B the delay between the frequencies in the
-receiver. I is the sum of a spatial field (an offset and two gradients, with the sigma of the model as prior) and a
-residual of each satellite. I and B are estimated from the mean differences of all satellites by best linear prediction.
-The range is then estimated by least squares from both codes, corrected for the predicted ionospheric delay. The weights
-account for the remaining ionospheric error, which affects the two codes differently.
+where I is the error of the modelled ionospheric delay on the first frequency, and B is the receiver delay between the
+frequencies. I is the sum of a spatial field (an offset and two gradients, with the sigma of the model as prior) and a
+residual of each satellite. I and B are estimated from the mean code differences of all satellites by best linear
+prediction. The range is then estimated by least squares from both codes, corrected for the predicted ionospheric delay.
+The weights account for the remaining ionospheric error, which differs between the two codes.
 """
 
 from __future__ import annotations
@@ -27,39 +28,39 @@ from railfix.positioning.noise_windows import correlated_sums
 from railfix.ranges.corrected import SecondCodes
 
 _FROM_MEAN_SIZE: Final = 1.2533  #: Inverse of the mean absolute value of a standard normal variable.
-_FIRST_SAMPLES: Final = 2.0  #: Number of prior samples, which have the noise that the weights assume.
-_CLIP: Final = 2.5  #: Limit to which the mean difference of a satellite is clipped [sigma].
-_LEAST_SUSPICION_M: Final = 3.0  #: Minimum difference of the two codes at which a range is suspected [m].
+_FIRST_SAMPLES: Final = 2.0  #: Number of prior samples; they have the assumed noise.
+_CLIP: Final = 2.5  #: Clipping limit of a satellite's mean code difference, in sigmas.
+_LEAST_SUSPICION_M: Final = 3.0  #: Minimum code difference of a suspected range [m].
 
 
 class TwoFrequencyLimits(Settings):
-    """Limits of the combination of two frequencies."""
+    """Limits of the two-frequency combination."""
 
-    #: Time constant of the mean differences of the codes. The error of the Klobuchar model changes over many minutes.
+    #: Time constant of the mean code differences. The error of the Klobuchar model changes over many minutes.
     window_s: float = Field(default=600.0, gt=0)
-    #: Epochs closer together than this count as one sample, because multipath errors of a train at rest are correlated.
+    #: Epochs within this time count as one sample, because multipath errors at standstill are correlated.
     correlation_s: float = Field(default=60.0, gt=0)
-    #: Standard deviation of the difference of two signals' broadcast group delays.
+    #: Standard deviation of the difference between the broadcast group delays of two signals.
     delay_sigma_m: float = Field(default=0.2, gt=0)
-    #: Difference of the two codes, in standard deviations, beyond which the weight of the range is reduced.
+    #: Code difference, in standard deviations, above which the weight of the range is reduced.
     suspicion: float = Field(default=4.0, gt=0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class TwoFrequencyState:
-    """Mean differences of the codes so far, for Q signal pairs of satellites."""
+    """Mean code differences so far, for Q pairs of signals of one satellite."""
 
     names: tuple[str, ...] = ()  #: Name of each pair.
-    #: Information [1/m^2] of each pair, then moments [1/m]; shape (2 Q,).
+    #: Information of each pair [1/m^2], followed by the moment of each pair [1/m], shape (2 Q,).
     sums: Floats = field(default_factory=lambda: np.empty(0))
-    #: Sum of the absolute differences divided by the assumed sigmas, and number of differences; shape (2,).
+    #: Sum of the absolute normalised code differences, and number of code differences, shape (2,).
     scale: Floats = field(default_factory=lambda: np.zeros(2))
     #: Time of the last epoch, NaT before the first.
     last: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    age: float = 0.0  #: Age of the last epoch since the start of the log [windows].
+    age: float = 0.0  #: Age of the last epoch since the start of the log, in windows of `window_s`.
 
     def with_pairs(self, names: tuple[str, ...]) -> tuple[TwoFrequencyState, Integers]:
-        """Return the state with the pairs of a chunk added, and the index of each of these pairs in the new state."""
+        """Return the state after adding the pairs of a chunk, and the index of each of these pairs in the new state."""
         if names == self.names:
             return self, np.arange(len(names))
         known = {name: i for i, name in enumerate(self.names)}
@@ -74,15 +75,15 @@ class TwoFrequencyState:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class Combined(NotebookTable):
-    """One pseudorange per satellite from two codes: T epochs by K channels; NaN where only the first code is used."""
+    """Pseudoranges from two codes, T epochs by K channels; NaN where only the first code is used."""
 
     code_m: Floats  #: Combined code, shape (T, K).
-    variance_m2: Floats  #: Variance of the combined code minus variance of the first code, shape (T, K).
-    share: Floats  #: Weight of the second code; the first code has 1 - `share`; shape (T, K).
-    ionosphere_m: Floats  #: Ionospheric delay on the first frequency minus the model's delay, shape (T, K).
+    variance_m2: Floats  #: Variance of the combined code minus that of the first code, shape (T, K).
+    share: Floats  #: Weight of the second code, shape (T, K). The first code has 1 - `share`.
+    ionosphere_m: Floats  #: Ionospheric delay on the first frequency minus modelled delay, shape (T, K).
     ionosphere_sigma_m: Floats  #: Standard deviation of `ionosphere_m`, shape (T, K).
-    difference_m: Floats  #: Second code minus first code, minus the predicted difference; shape (T, K).
-    suspected: Masks  #: Ranges whose `difference_m` exceeds the limit, shape (T, K).
+    difference_m: Floats  #: Code difference minus its prediction, shape (T, K).
+    suspected: Masks  #: True for ranges whose `difference_m` exceeds its limit, shape (T, K).
 
 
 def combine_codes(
@@ -95,12 +96,12 @@ def combine_codes(
     state: TwoFrequencyState,
     limits: TwoFrequencyLimits,
 ) -> tuple[Combined, TwoFrequencyState]:
-    """Return the combined codes, with the ionosphere estimated from earlier epochs, and the new state.
+    """Return combined codes and the new state. The ionospheric delay is estimated from earlier epochs.
 
-    `code_m`, shape (T, K), are corrected first codes, NaN where unusable, and `noise_m` the sigmas of their noise.
-    `field_m`, shape (T, K, 4), are signed standard deviations of the modelled ionosphere on the first frequency, due to
-    the offset, the two gradients and the satellite's residual. `pairs` are the names of the pairs, length Q, and the
-    group of each pair; the receiver delay is common to a group.
+    `code_m`, shape (T, K), are corrected first codes, NaN where unusable, and `noise_m` are their noise sigmas.
+    `field_m`, shape (T, K, 4), are signed standard deviations of the modelled ionospheric delay on the first frequency,
+    for the offset, the two gradients and the satellite's residual. `pairs` are the names and the groups of Q signal
+    pairs. All pairs of a group have the same receiver delay.
     """
     names, groups = pairs
     own, number = state.with_pairs(names)
@@ -122,7 +123,7 @@ def combine_codes(
     known = both & (information > 0.0)
     mean[known] = before[np.nonzero(known)[0], size + at[known]] / information[known]
     scale, of_scale = _noise_scale(time, difference - mean, variance, known, own, ages)
-    # for errors that are constant over a time C, the mean over a time T has 1 + T / C independent samples
+    # if errors are constant over a time C, the mean over a time T has 1 + T / C independent samples
     of_mean = scale[:, None] / (information + 1.0 / np.where(known, variance, 1.0))
     lever = second.ratio - 1.0
     delay = second.delay_sigma_m**2 + limits.delay_sigma_m**2
@@ -131,7 +132,7 @@ def combine_codes(
     error = of_mean + delay + lever**2 * own_m2
     group = np.where(known, groups[second.pair], -1) if size else second.pair
     weight = np.where(known, 1.0 / error, 0.0)
-    for _ in range(2):  # in the second pass an outlying satellite has a small weight
+    for _ in range(2):  # in the second pass, outliers have small weights
         field, of_field, bias, of_bias = _fit_field(mean, basis[..., :3], lever, weight, group)
         rest = mean - bias - lever * field
         weight = np.where(known, 1.0 / (error + (rest / _CLIP) ** 2), 0.0)
@@ -140,7 +141,7 @@ def combine_codes(
     prior = of_field + own_m2
     p1, p2 = code_m - ionosphere, second.code_m - bias - second.ratio * ionosphere - delay * rest
     noise = np.minimum(scale, 1.0)[:, None]
-    # the part of the ionospheric error that the means reveal is already removed from both codes
+    # both codes are already corrected for the ionospheric error estimated from the mean differences
     untold = of_mean / (error + of_bias + lever**2 * of_field)
     share, total = share_of_second(
         scale[:, None] * first, scale[:, None] * other + untold * (delay + of_bias), second.ratio, untold * prior
@@ -162,10 +163,11 @@ def combine_codes(
 def ionosphere_free(
     code_m: Floats, noise_m: Floats, second: SecondCodes, delays_m: tuple[Floats, ...], found: Combined
 ) -> Combined:
-    """Return the ionosphere-free combination of two codes; their difference is tested as in `combine_codes`.
+    """Return the ionosphere-free combination of two codes; the test of their difference is unchanged.
 
-    The combination is ``P = (ratio P1 - P2) / (ratio - 1)``; its noise is not smoothed over epochs. `delays_m` are the
-    group delays contained in the corrections of the first and the second code, shapes (T, K); they are added back.
+    The combination is ``P = (ratio P1 - P2) / (ratio - 1)``. Its noise is not smoothed over epochs. `delays_m` are the
+    group delays, shape (T, K), contained in the corrections of the first and the second code; they are added back.
+    `found` is the result of `combine_codes`.
     """
     share = np.where(np.isfinite(code_m + second.code_m), -1.0 / (second.ratio - 1.0), np.nan)
     first, other = code_m + delays_m[0], second.code_m + delays_m[1]
@@ -177,9 +179,10 @@ def ionosphere_free(
 
 
 def share_of_second(first_m2: Floats, second_m2: Floats, ratio: Floats, ionosphere_m2: Floats) -> tuple[Floats, Floats]:
-    """Return the least-squares weight of the second code in the range, and the variance of the codes' difference.
+    """Return the least-squares weight of the second code, and the variance of the code difference.
 
-    `first_m2` and `second_m2` exclude the ionosphere; a large `ionosphere_m2` gives the ionosphere-free combination.
+    The variances `first_m2` and `second_m2` of the codes exclude the ionosphere. A large `ionosphere_m2` results in the
+    ionosphere-free combination.
     """
     total = first_m2 + second_m2 + (ratio - 1.0) ** 2 * ionosphere_m2
     return (first_m2 - (ratio - 1.0) * ionosphere_m2) / total, total
@@ -188,7 +191,7 @@ def share_of_second(first_m2: Floats, second_m2: Floats, ratio: Floats, ionosphe
 def _noise_scale(
     time: Datetimes, deviation: Floats, variance: Floats, known: Masks, own: TwoFrequencyState, ages: dict[str, float]
 ) -> tuple[Floats, Floats]:
-    """Return the differences' variance divided by the assumed value, from earlier epochs (T,), and the new sums."""
+    """Return the ratio of actual to assumed variance of the code differences in earlier epochs, and the new sums."""
     size = np.where(known, np.abs(deviation) / np.sqrt(np.where(known, variance, 1.0)), 0.0)
     sample = np.stack([channel_sums(size), channel_sums(known.astype(np.float64))], axis=1)
     last_epoch = [(own.last, own.age)]
@@ -200,9 +203,9 @@ def _noise_scale(
 def _fit_field(
     mean: Floats, basis: Floats, lever: Floats, weight: Floats, group: Integers
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Fit the field of the ionosphere, and the receiver delay of each group, to mean differences.
+    """Fit the spatial ionospheric field and the receiver delay of each group to mean code differences.
 
-    Returns the field and its variance, and the delay and its variance, at each channel, shapes (T, K).
+    Return the field, its variance, the receiver delay and its variance for each channel, shape (T, K) each.
     """
     values = np.concatenate([lever[..., None] * basis, mean[..., None]], axis=-1)
     centre, of_centre = np.zeros(values.shape), np.zeros(mean.shape)

@@ -1,10 +1,10 @@
-"""Phase ambiguities, estimated with positions along the line (P4, constrained to the map), and integer fixing.
+"""Phase ambiguities estimated together with positions along the line (P4), and integer fixing.
 
 The unknowns of the epochs (distance and clocks) are eliminated, so that the normal matrix has one row per phase arc.
-Integers are fixed where the probability of a wrong integer is small enough. The probability follows from Bayes' rule:
-the density of the float ambiguities at one vector of integers is compared with the density at all other vectors, and
-with the uniform density of non-integer phases (multipath, half cycles), whose prior probability is
-`PhaseLimits.no_integer_prior`.
+Integers are fixed where the probability of a wrong integer is small enough. This probability follows from Bayes' rule.
+The density of the float ambiguities at one integer vector is compared with the density at all other integer vectors,
+and with the uniform density of non-integer phases (multipath, half cycles). `PhaseLimits.no_integer_prior` is the prior
+probability of non-integer phases.
 """
 
 from __future__ import annotations
@@ -24,31 +24,31 @@ from railfix.positioning.range_arrays import Ranges
 from railfix.positioning.standstill_phase import IntegerSearch
 from railfix.track.trajectory import Trajectory
 
-FREE_AMBIGUITY_M: Final = 1e4  #: Prior sigma of an ambiguity about its first value, a loose prior for conditioning [m].
-FORGET_S: Final = 600.0  #: An arc that is not observed for this time is restarted [s].
+FREE_AMBIGUITY_M: Final = 1e4  #: Loose prior sigma of an ambiguity about its first value, for conditioning [m].
+FORGET_S: Final = 600.0  #: An arc that is not observed for this time ends [s].
 
 
 class PhaseLimits(Settings):
     """Limits of the float ambiguities."""
 
-    clocks: PhaseClocks = "own"  #: Receiver clock of the phases, separate or shared with the codes (P4).
-    #: [m/sqrt(s)] Random walk of an ambiguity. It covers changes of ionosphere, satellite orbit and clock, and
-    #: multipath in one phase relative to the other phases. Without a random walk, phases that drift by centimetres
-    #: while satellites move by hundredths of a radian bias the position by metres. With a code noise of 1 m at 1 Hz,
-    #: the value 0.01 averages over about 100 s. With the value 0, ambiguities are constant.
+    clocks: PhaseClocks = "own"  #: Receiver clock of the phases: separate ("own"), or shared with the codes (P4).
+    #: [m/sqrt(s)] Random walk of an ambiguity. It covers changes of ionospheric, orbit, satellite clock and multipath
+    #: errors of one phase relative to the other phases. Without a random walk, phases that drift by centimetres while
+    #: satellites move by hundredths of a radian bias the position by metres. With a code noise of 1 m at 1 Hz, the
+    #: default averages over about 100 s. With 0, ambiguities are constant.
     drift_m: float = Field(default=0.01, ge=0)
     hop_s: float = Field(default=10.0, gt=0)  #: Time step of the random walk.
-    #: Correlation time of code errors. Epochs closer together than this add no information on the ambiguities, so the
-    #: variance of the ambiguities is multiplied by correlation / interval, at most up to the variance of codes alone.
-    #: The positions do not change. Use 0 for white noise, for example in simulations.
+    #: Correlation time of code errors. Epochs within this time add no information on the ambiguities. The variance of
+    #: the ambiguities is therefore multiplied by correlation time / interval, at most up to the variance from codes
+    #: alone. The positions do not change. Use 0 for white noise, for example in simulations.
     correlation_s: float = Field(default=20.0, ge=0)
-    #: Number of linearisations. Each linearisation has a separate state, so that results do not depend on chunks.
+    #: Number of linearisations. Each has a separate state, so that results do not depend on the division into chunks.
     passes: int = Field(default=2, ge=1)
-    #: Largest probability of a wrong integer at which ambiguities are fixed, with a base station.
+    #: Largest probability of a wrong integer at which ambiguities are fixed. Fixing requires a base station.
     integer_risk: float = Field(default=1e-4, gt=0, lt=0.5)
-    #: Prior probability that phases are not whole cycles (multipath, half a cycle).
+    #: Prior probability of non-integer phases (multipath, half cycles).
     no_integer_prior: float = Field(default=1e-2, gt=0, lt=1)
-    #: Largest sigma along the line due to noise; epochs with a larger sigma have no position.
+    #: Largest noise sigma along the line. Epochs with a larger noise sigma have no position.
     largest_sigma_m: float = Field(default=1e3, gt=0)
 
 
@@ -59,7 +59,7 @@ def number_hops(time: Datetimes, limits: PhaseLimits) -> Integers:
 
 
 def count_repeats(time: Datetimes, limits: PhaseLimits) -> Floats:
-    """Return the number of epochs per correlation time, computed from each epoch's interval; at least 1; shape (T,)."""
+    """Return the number of epochs per correlation time from each epoch's interval, at least 1, shape (T,)."""
     step = np.append(np.nan, seconds(np.diff(time)))
     with np.errstate(divide="ignore"):
         share = limits.correlation_s / step
@@ -68,36 +68,36 @@ def count_repeats(time: Datetimes, limits: PhaseLimits) -> Floats:
 
 @dataclass(frozen=True, kw_only=True)
 class ArcAmbiguities:
-    """Ambiguities of A arcs."""
+    """Ambiguities of A phase arcs."""
 
     arc_id: Integers  #: Number of each arc (`number_arcs`), shape (A,).
-    #: Phase minus range minus clock, which contains whole cycles, phase wind-up and signal delays; shape (A,). With
-    #: separate phase clocks, ambiguities are determined up to a common constant: the mean of the corrections to their
-    #: first values is set to zero, and the covariance is relative to this mean.
+    #: Phase minus distance minus clock, shape (A,). It contains whole cycles, phase wind-up and signal delays. With a
+    #: separate phase clock, ambiguities are determined except for a common constant. The mean of the corrections to
+    #: their first values is then set to zero, and the covariance is relative to this mean.
     ambiguity_m: Floats
-    covariance_m2: Floats  #: Covariance of noise alone, without the map error; shape (A, A).
+    covariance_m2: Floats  #: Noise covariance without the map error, shape (A, A).
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class PhasePositions(NotebookTable):
     """Positions along the line from code and phase, T epochs by M channels."""
 
-    #: Arc length within the trajectory; NaN without an initial position or with too large a sigma; shape (T,).
+    #: Arc length, shape (T,); NaN without an initial position or if `noise_sigma_m` is too large.
     arc_m: Floats
-    sigma_m: Floats  #: Standard deviation, including the map error; shape (T,).
-    noise_sigma_m: Floats  #: Standard deviation due to noise alone, shape (T,).
-    clock_m: Floats  #: Receiver clock of each group; NaN without a position; shape (T, G).
-    code_residual_m: Floats  #: Observed minus computed code; NaN where not used; shape (T, M).
-    phase_residual_m: Floats  #: Observed minus computed phase; NaN where not used; shape (T, M).
-    ambiguity_m: Floats  #: Ambiguity of the arc of each used phase, as estimated at the epoch; shape (T, M).
+    sigma_m: Floats  #: Standard deviation of `arc_m`, including the map error, shape (T,).
+    noise_sigma_m: Floats  #: Standard deviation of `arc_m` due to noise alone, shape (T,).
+    clock_m: Floats  #: Receiver clock of each group, shape (T, G); NaN without a position.
+    code_residual_m: Floats  #: Observed minus computed code, shape (T, M); NaN if unused.
+    phase_residual_m: Floats  #: Observed minus computed phase, shape (T, M); NaN if unused.
+    ambiguity_m: Floats  #: Ambiguity of each used phase, as estimated at the epoch, shape (T, M).
     ambiguity_sigma_m: Floats  #: Standard deviation of `ambiguity_m`, shape (T, M).
     n_codes: Integers  #: Number of used codes, shape (T,).
     n_phases: Integers  #: Number of used phases, shape (T,).
-    n_fixed: Integers  #: Number of ambiguity differences fixed to whole cycles, shape (T,).
-    #: Probability that a fixed difference is wrong, or, if none is fixed, that the best candidate is wrong; NaN where
-    #: there are no differences; shape (T,).
+    n_fixed: Integers  #: Number of ambiguity differences that are fixed to whole cycles, shape (T,).
+    #: Probability that the fixed integers or, if none are fixed, the best candidate integers are wrong, shape (T,); NaN
+    #: without candidates.
     integer_risk: Floats
-    arcs: ArcAmbiguities | None  #: Arcs that continue after the last epoch; None in results of the pipeline.
+    arcs: ArcAmbiguities | None  #: Arcs that are active after the last epoch; None in pipeline results.
 
     iterations: int  #: Number of linearisations.
 
@@ -105,9 +105,9 @@ class PhasePositions(NotebookTable):
 def prepare_start(
     ranges: Ranges, phases: Phases, trajectory: Trajectory, arc_m: Floats
 ) -> tuple[Ranges, Phases, Floats]:
-    """Return ranges, phases and initial positions; epochs without a position have weight 0 and arc length 0.
+    """Return ranges, phases and initial positions; epochs without a position have zero weights and arc length 0.
 
-    Raises ValueError if shapes differ or a used phase has no arc.
+    Raise ValueError if shapes differ or a used phase has no arc.
     """
     shape = ranges.code_m.shape
     if phases.phase_m.shape != shape or phases.weight.shape != shape or phases.arc_id.shape != shape:
@@ -125,9 +125,8 @@ def prepare_start(
 def inverse_of_arcs(matrix: Floats, held: Floats) -> Floats:
     """Return the inverse of normal matrices of ambiguities, shape (..., A, A).
 
-    With separate phase clocks, a constant common to all ambiguities is unobservable. The constant is chosen so that the
-    mean of the ambiguities marked by `held` is zero; `held`, shape (..., A), is 1 or 0. Differences of ambiguities do
-    not depend on the choice.
+    With a separate phase clock, a constant common to all ambiguities is unobservable. It is chosen so that the mean of
+    the ambiguities with `held` equal to 1, shape (..., A), is zero. Ambiguity differences do not depend on this choice.
     """
     size = matrix.shape[-1]
     count = np.maximum(held.sum(axis=-1), 1.0)
@@ -147,7 +146,7 @@ def assemble_positions(
     fixes: tuple[Integers, Floats],
     limits: PhaseLimits,
 ) -> PhasePositions:
-    """Return the positions of a run, NaN where missing; `ambiguity` has values [m] and variances [m^2]."""
+    """Return the positions of a segment, NaN where missing; `ambiguity` has values [m] and variances [m^2]."""
     (ambiguity_m, variance_m2), has = ambiguity, started & (own.noise_sigma_m <= limits.largest_sigma_m)
     code, phase = lin.code_weight > 0, lin.phase_weight > 0
     return PhasePositions(
@@ -168,20 +167,20 @@ def assemble_positions(
     )
 
 
-_VECTORS: Final = 12  #: Number of candidate integer vectors that are compared.
-#: Fractions of the differences that are fixed together, tried in this order; the strongest phases are fixed first.
+_VECTORS: Final = 12  #: Number of compared integer vectors.
+#: Fractions of the ambiguity differences that are fixed together, tried in this order, strongest phases first.
 _SHARES: Final = (1.0, 0.75, 0.5)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fixed:
-    """Ambiguities of A arcs, with the sufficiently certain differences fixed."""
+    """Ambiguities of A arcs after integer fixing."""
 
-    value_m: Floats  #: Ambiguities, and their responses to map errors of 1 m across and in height; shape (A, 3).
-    covariance_m2: Floats  #: Covariance of noise alone, shape (A, A).
+    value_m: Floats  #: Ambiguities, and their changes for a map error of 1 m across and in height, shape (A, 3).
+    covariance_m2: Floats  #: Noise covariance, shape (A, A).
     count: int  #: Number of fixed differences; 0 for float ambiguities.
-    #: Probability that a fixed difference is wrong, or, if none is fixed, that the best candidate is wrong; NaN where
-    #: there are no differences.
+    #: Probability that the fixed integers or, if none are fixed, the best candidate integers are wrong; NaN without
+    #: candidates.
     risk: float
 
 
@@ -195,16 +194,16 @@ def fix_integers(
     largest_risk: float,
     no_integer_prior: float,
 ) -> Fixed:
-    """Fix differences of float ambiguities to whole cycles, or return the float ambiguities if the risk is too large.
+    """Fix differences of float ambiguities to whole cycles; if the risk is too large, return the float ambiguities.
 
     Parameters
     ----------
     value_m : ndarray, shape (A, 3) [m]
-        Float ambiguities, and their responses to map errors of 1 m across and in height.
+        Float ambiguities, and their changes for a map error of 1 m across and in height.
     covariance_m2 : ndarray, shape (A, A) [m^2]
-        Covariance of noise alone.
+        Noise covariance.
     strength : ndarray, shape (A,)
-        Weight of each phase; the strongest phase of a group is the reference of its differences.
+        Weight of each phase. The phase with the largest weight is the reference of its group.
     channels : IntegerChannels
         Wavelength and group of each arc.
     map_sigma_m : tuple of float
@@ -232,7 +231,7 @@ def fix_integers(
 
 
 def _differences(strength: Floats, group: Integers) -> tuple[Indices, Indices]:
-    """Return pairs of an arc and the reference arc of its group, sorted by descending strength of the first arc."""
+    """Return pairs of an arc and its group's reference arc, sorted by descending strength of the former."""
     first, second = [], []
     for each in np.unique(group[group >= 0]).tolist():
         own = np.flatnonzero(group == each)
@@ -250,7 +249,7 @@ def _fix_pairs(
     map_sigma_m: Floats,
     no_integer_prior: float,
 ) -> Fixed | None:
-    """Fix all differences of some pairs to the most probable integers; return None if their covariance is singular."""
+    """Fix the differences of `pairs` to the most probable integers; return None if their covariance is singular."""
     value, noise = ambiguities
     rows = np.arange(len(wavelength_m))
     design = np.zeros((len(rows), len(value)))
@@ -268,7 +267,7 @@ def _fix_pairs(
     log_density = -0.5 * (squares + np.linalg.slogdet(2.0 * np.pi * covariance)[1])
     peak = max(float(log_density[0]), 0.0)
     weight = (1.0 - no_integer_prior) * np.exp(log_density - peak)
-    # phases that are not whole cycles have a uniform density of one per cycle
+    # non-integer phases have a uniform density of one per cycle
     others = weight[1:].sum() + no_integer_prior * np.exp(-peak)
     step = np.zeros((len(rows), 3))
     step[:, 0] = cycles - integers[0]

@@ -1,14 +1,14 @@
-"""Cycle slips and gaps of the phase, and carrier-smoothed codes (Hatch filter).
+"""Cycle slips and gaps of carrier phases, and carrier-smoothed codes (Hatch filter).
 
-The change of the phase is compared with the Dopplers, ``(phase_k - phase_{k-1}) + lambda (D_k + D_{k-1}) / 2 dt``, or,
-where Dopplers are missing, with the change of the code. The median over the channels is subtracted, because a step of
-the receiver clock is common to all channels. Codes refer to the time tags, so the true interval is the difference of
-the time tags minus the step of the codes. Phases either step together with the codes, or continue without a step.
-Phases without the step differ from the codes by whole milliseconds, which are added in `Slips.phase_m`.
+The phase change is compared with the Dopplers, ``(phase_k - phase_{k-1}) + lambda (D_k + D_{k-1}) / 2 dt``, or, where
+Dopplers are missing, with the code change. The median over the channels is subtracted, because a receiver clock step is
+common to all channels. The true interval between epochs is the difference of the time tags minus the clock step of the
+codes. Some receivers step the phases together with the codes. If the phases continue without the step, they differ from
+the codes by whole milliseconds, which are added in `Slips.phase_m`.
 
-The smoothed code is the phase plus the mean of code minus phase over the arc so far. The ionosphere makes this mean
-drift by twice the change of its delay. The window limits the effect: at 1 mm/s and with a window of 100 s, it is at
-most 0.2 m.
+The smoothed code is the phase plus the mean of code minus phase over the arc so far. This mean drifts by twice the
+change of the ionospheric delay. The window limits the effect: for a change of 1 mm/s and a window of 100 s, the error
+is at most 0.2 m.
 """
 
 from __future__ import annotations
@@ -28,85 +28,85 @@ from railfix.core.timescale import seconds
 from railfix.gnss.observations import Observations, carrier_frequency_hz
 from railfix.positioning.carrier.continuity import ChannelKeys, channel_keys, rows_before
 
-#: One millisecond as a distance [m]: the clock step of receivers that keep their clock near GPS time.
+#: Clock step of one millisecond [m], used by receivers that keep their clock near GPS time.
 MILLISECOND_M: Final = 1e-3 * SPEED_OF_LIGHT
-#: A larger change common to all codes counts as a step of the receiver clock, and corrects the interval [m].
+#: Larger common changes of all codes count as receiver clock steps [m].
 _CLOCK_STEP_M: Final = 1e4
-_COMMON: Final = 3  #: Fewest channels whose median represents the receiver clock.
+_COMMON: Final = 3  #: Minimum number of channels for a median.
 
 
 class SlipReason(IntFlag):
-    """Reasons for a new arc of the phase at an epoch and channel; 0 where the arc continues."""
+    """Reasons for a new phase arc at an epoch and channel; 0 where the arc continues."""
 
     JOINED = 0
-    NO_PHASE = 1 << 0  #: No phase at this epoch, so that no arc begins.
+    NO_PHASE = 1 << 0  #: No phase at this epoch; no arc begins.
     FIRST = 1 << 1  #: The channel had no phase at the previous epoch.
     LOSS_OF_LOCK = 1 << 2  #: Bit 0 of the receiver's loss-of-lock indicator is set.
-    HALF_CYCLE = 1 << 3  #: Bit 1 of the indicator (half-cycle ambiguity) differs from the previous epoch.
-    GAP = 1 << 4  #: The interval since the previous epoch exceeds the limit.
+    HALF_CYCLE = 1 << 3  #: Bit 1 (half-cycle ambiguity) of this indicator has changed since the previous epoch.
+    GAP = 1 << 4  #: The interval since the previous epoch exceeds `max_gap_s`.
     BREAK = 1 << 5  #: The log marks a break before this epoch.
     DOPPLER = 1 << 6  #: The phase change disagrees with the Dopplers.
-    CODE = 1 << 7  #: The phase change disagrees with the code; tested where Dopplers are absent or less precise.
+    CODE = 1 << 7  #: The phase change disagrees with the code change. Tested without precise Dopplers.
 
 
 class CycleSlipLimits(Settings):
-    """Limits of the slip tests, in metres, for an interval dt in seconds.
+    """Limits of the slip tests for an interval dt.
 
-    The Doppler test rejects a change above ``doppler_m + doppler_mps dt + jerk_mps3 dt^3 / 12``. The terms are the
-    noise of the phases, the noise of the mean Doppler, and the error of the trapezoidal rule for a motion with this
-    jerk. One cycle on L1 (0.19 m) is detected up to intervals of about 1 s, two cycles up to 1.5 s; the test on the
-    track (`continuity.track_jumps`) has no such limit.
+    The Doppler test rejects a change above ``doppler_m + doppler_mps dt + jerk_mps3 dt^3 / 12``. The three terms are
+    phase noise, mean Doppler noise, and the error of the trapezoidal rule for a motion with this jerk. A slip of one
+    cycle on L1 (0.19 m) is detected for intervals up to about 1 s, and of two cycles up to 1.5 s. The test on the track
+    (`continuity.track_jumps`) has no such limit.
     """
 
-    #: Longest interval without a new arc; station logs have intervals of 30 s.
+    #: Longest interval across which an arc continues. Station logs have intervals of 30 s.
     max_gap_s: float = Field(default=31.0, gt=0)
-    #: Constant part of the limit of the phase change minus the change predicted from Dopplers. On real receivers at 1
-    #: Hz the median of this difference is 0.01 to 0.04 m.
+    #: Constant part of the limit of phase change minus predicted change from Dopplers. For recorded data at 1 Hz, the
+    #: median of this difference is 0.01 to 0.04 m.
     doppler_m: float = Field(default=0.05, gt=0)
-    #: Part of the same limit that is proportional to the interval.
+    #: Part of the Doppler test limit that is proportional to the interval.
     doppler_mps: float = Field(default=0.05, gt=0)
-    jerk_mps3: float = Field(default=0.5, gt=0)  #: Jerk of the antenna; passenger trains stay below 0.5.
-    #: Limit of the change of code minus phase, tested where Dopplers are absent or less precise.
+    jerk_mps3: float = Field(default=0.5, gt=0)  #: Largest jerk of the antenna; passenger trains have less.
+    #: Limit of the change of code minus phase. This test is used without Dopplers, or if the Doppler limit is larger.
     code_m: float = Field(default=10.0, gt=0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class CycleSlipState:
-    """Observations of the last epoch of a chunk, by channel ("G05", "1C"), and the clock steps so far."""
+    """State after a chunk: observations of the last epoch by channel ("G05", "1C"), and clock steps so far."""
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: NaT before the first epoch.
     channels: ChannelKeys = ()
     code_m: Floats = field(default_factory=lambda: np.empty(0))  #: Code, shape (M,).
-    phase_m: Floats = field(default_factory=lambda: np.empty(0))  #: Phase as received, without `step_ms`; shape (M,).
+    phase_m: Floats = field(default_factory=lambda: np.empty(0))  #: Received phase without `step_ms`, shape (M,).
     doppler_mps: Floats = field(default_factory=lambda: np.empty(0))  #: Doppler times wavelength, shape (M,).
     half_cycle: Masks = field(default_factory=lambda: np.empty(0, dtype=np.bool_))  #: Shape (M,).
-    step_ms: int = 0  #: Sum of the clock steps so far that are in the codes but not in the phases [ms].
+    step_ms: int = 0  #: Sum of all clock steps of the codes that the phases lack [ms].
 
 
 @dataclass(frozen=True, kw_only=True)
 class Slips:
-    """Phases and the starts of their arcs, T epochs by M channels."""
+    """Phases and starts of phase arcs, T epochs by M channels."""
 
     slip: Masks  #: True where a phase starts a new arc, shape (T, M).
     reason: Integers  #: `SlipReason` bits, shape (T, M).
-    #: Phase times wavelength, referred to the clock of the codes: steps of whole milliseconds that only the codes have
-    #: are added. NaN where the phase is missing or its wavelength is unknown; shape (T, M).
+    #: Phase times wavelength, shape (T, M); NaN where phase or wavelength is unknown. Clock steps that only the codes
+    #: have are added, so that codes and phases refer to the same clock.
     phase_m: Floats
-    doppler_metric_m: Floats  #: Metric of the Doppler test; NaN where the test is not possible; shape (T, M).
-    code_metric_m: Floats  #: Metric of the code test; NaN where the test is not possible; shape (T, M).
+    doppler_metric_m: Floats  #: Metric of the Doppler test, shape (T, M); NaN where not testable.
+    code_metric_m: Floats  #: Metric of the code test, shape (T, M); NaN where not testable.
     doppler_limit_m: Floats  #: Limit of `doppler_metric_m`, shape (T,).
-    #: Step of the receiver clock since the previous epoch, from the codes; 0 where none is detected; shape (T,).
+    #: Receiver clock step of the codes since the previous epoch, shape (T,); 0 where no step is detected.
     clock_step_m: Floats
     half_cycle: Masks  #: True where the receiver reports an unresolved half cycle, shape (T, M).
 
 
 def median_or_zero(values: Floats) -> Floats:
-    """Return the median over the channels of each epoch, shape (T,); 0 where fewer than three have a value."""
+    """Return the median over the channels of each epoch, shape (T,); 0 for fewer than three values."""
     return np.where(np.isfinite(values).sum(axis=1) >= _COMMON, medians(values), 0.0)
 
 
 def _before(values: Floats, last: Floats) -> Floats:
-    """Return for each epoch the values of the previous epoch, and `last` for the first epoch."""
+    """Return the values of the previous epoch for each epoch; `last` has those before the first epoch."""
     return np.concatenate([last[None], values[:-1]])
 
 
@@ -120,7 +120,7 @@ def find_slips(
     """Return the cycle slips of every channel of a chunk.
 
     The first phase of a channel after an epoch without a phase is also reported, because it starts a new arc. With
-    fewer than three channels a clock step cannot be distinguished from a slip, and is reported as a slip.
+    fewer than three channels, a clock step cannot be distinguished from a slip and is reported as a slip.
 
     Parameters
     ----------
@@ -129,7 +129,7 @@ def find_slips(
     state : CycleSlipState, optional
         State after the previous chunk; None at the start of a log.
     frequency_hz : ndarray, shape (M,), optional [Hz]
-        Carrier frequency of each channel; by default from the log's header, which may lack GLONASS frequency channels.
+        Carrier frequency of each channel. By default, the log's header is used, which may lack GLONASS channels.
     limits : CycleSlipLimits, optional
 
     Returns
@@ -196,10 +196,10 @@ def find_slips(
 def slip_metrics(
     dt: Floats, code_m: Floats, phase_m: Floats, range_mps: Floats
 ) -> tuple[Floats, Integers, Floats, Floats]:
-    """Compute the clock step of the codes [m], the part of the step that the phases lack [ms], and both tests' metrics.
+    """Return the clock step of the codes [m], its part that the phases lack [ms], and the metrics of both tests.
 
-    `dt`, shape (T,), is the time since the previous epoch; `code_m` and `phase_m`, shape (T, M), are changes since
-    that epoch, and `range_mps` is the range rate from the Dopplers.
+    `dt`, shape (T,), is the time since the previous epoch. `code_m` and `phase_m`, shape (T, M), are the changes since
+    the previous epoch, and `range_mps` is the mean range rate from the Dopplers.
     """
     moved = np.where(np.isnan(range_mps), 0.0, range_mps) * dt[:, None]
     step = median_or_zero(code_m - moved)
@@ -212,11 +212,11 @@ def slip_metrics(
 
 
 def linear_recursion(gain: Floats, drive: Floats) -> Floats:
-    """Compute ``x_k = gain_k x_{k-1} + drive_k`` along axis 0 with x_{-1} = 0, without a loop over epochs.
+    """Return ``x_k = gain_k x_{k-1} + drive_k`` along axis 0, with x_{-1} = 0, without a loop over epochs.
 
-    Pairs (gain, drive) are composed over strides of 1, 2, 4, ...; rounding errors do not grow for gains in [0, 1].
+    Pairs (gain, drive) are combined over strides of 1, 2, 4, ... Rounding errors do not grow for gains in [0, 1].
     """
-    total, factor = drive.copy(), gain.copy()  # gains may have fewer elements, `drive` is broadcast
+    total, factor = drive.copy(), gain.copy()  # `gain` may have fewer columns than `drive`
     stride = 1
     while stride < len(total):
         total[stride:] = total[stride:] + factor[stride:] * total[:-stride]
@@ -226,44 +226,44 @@ def linear_recursion(gain: Floats, drive: Floats) -> Floats:
 
 
 class SmoothingLimits(Settings):
-    """Limits of the smoothing."""
+    """Limits of code smoothing."""
 
-    #: Time constant. All codes of an arc have equal weight until the arc has this age; then the weight of older codes
-    #: decays (DO-229D 2.1.4.1.5: 100 s, because of the drift of the ionospheric delay).
+    #: Time constant; 100 s in DO-229D 2.1.4.1.5 because of the ionospheric drift. All codes of an arc have equal weight
+    #: until the arc has this age. Afterwards, the weight of older codes decays.
     window_s: float = Field(default=100.0, gt=0)
-    #: With "own", the mean change of code minus phase over all channels is a clock, which is subtracted before and
-    #: added after averaging. Telephones require "own", because their codes jump together by tens of metres: in a town,
-    #: smoothing with "own" reduced the 95 % error along the line from 10.8 to 7.0 m; with "shared" the error was 50 m.
-    #: Results of other receivers were not worse with "own".
+    #: With "own", the mean change of code minus phase over all channels counts as a clock. It is subtracted before
+    #: averaging and added afterwards. Telephones require "own", because their codes jump together by tens of metres. In
+    #: a town, smoothing with "own" reduced the 95 % error along the line from 10.8 to 7.0 m; with "shared", it was 50
+    #: m. Other receivers were not less accurate with "own".
     clocks: Literal["own", "shared"] = "own"
 
 
 @dataclass(frozen=True, kw_only=True)
 class SmoothingState:
-    """State of the smoothing after the last epoch of a chunk, by channel."""
+    """State of the smoothing after a chunk, by channel."""
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: NaT before the first epoch.
     channels: ChannelKeys = ()
-    #: First value of code minus phase on the current arc; NaN without an arc; shape (M,).
+    #: First value of code minus phase on the current arc, shape (M,); NaN without an arc.
     base_m: Floats = field(default_factory=lambda: np.empty(0))
-    #: Smoothed code minus phase, minus `base_m`; shape (M,).
+    #: Mean of code minus phase, minus `base_m`, shape (M,).
     offset_m: Floats = field(default_factory=lambda: np.empty(0))
     #: Number of codes of the current arc, shape (M,).
     count: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-    #: Last value of code minus phase, for `clocks="own"`; shape (M,).
+    #: Last value of code minus phase, used for `clocks="own"`, shape (M,).
     last_m: Floats = field(default_factory=lambda: np.empty(0))
-    clock_m: float = 0.0  #: Sum of the mean changes of code minus phase so far, for `clocks="own"`.
+    clock_m: float = 0.0  #: Clock for `clocks="own"`: sum of the mean changes of code minus phase so far.
 
 
 def _hold(values: Floats, at: Masks, first: Floats) -> Floats:
-    """Return values at marked epochs, constant until the next mark, and `first` before the first mark; shape (T, M)."""
+    """Return the value at the last epoch marked by `at`, or `first` before any mark, shape (T, M)."""
     rows = np.where(at, np.arange(1, len(values) + 1)[:, None], 0)
     rows = np.maximum.accumulate(rows, axis=0)
     return np.asarray(np.take_along_axis(np.concatenate([first[None], values]), rows, axis=0))
 
 
 def _common_change(difference: Floats, begins: Masks, last: Floats) -> Floats:
-    """Return the mean change of code minus phase over channels whose arc continues, shape (T,); 0 without channels."""
+    """Return the mean change of code minus phase over channels whose arc continues, shape (T,); 0 if there are none."""
     change = np.where(begins, np.nan, difference - np.concatenate([last[None], difference[:-1]]))
     number = np.isfinite(change).sum(axis=1)
     return np.asarray(np.nansum(change, axis=1) / np.maximum(number, 1))
@@ -282,16 +282,15 @@ def smooth_codes(
 ) -> tuple[Floats, SmoothingState]:
     """Return codes smoothed by the phase along unbroken arcs.
 
-    The weight of the n-th code of an arc is the greater of 1/n and dt / window. Phases are of the order of 1e8 m, where
-    double precision resolves 1.5e-8 m. The recursion therefore uses the difference code minus phase, minus the first
-    difference on the arc. This is of the order of metres, so that rounding errors do not accumulate.
+    The weight of the n-th code of an arc is the greater of 1/n and dt / window. To avoid accumulated rounding errors
+    (phases of 1e8 m are resolved to 1.5e-8 m), the recursion uses code minus phase, minus its first value on the arc.
 
     Parameters
     ----------
     time : ndarray of datetime64[ns], shape (T,)
     satellite, signal : ndarray of str, shape (M,)
     code_m, phase_m : ndarray, shape (T, M) [m]
-        Raw codes, and `Slips.phase_m`; NaN where absent.
+        Raw codes, and phases (`Slips.phase_m`); NaN where missing.
     slip : ndarray of bool, shape (T, M)
         True where an arc begins.
     state : SmoothingState, optional
@@ -300,10 +299,10 @@ def smooth_codes(
     Returns
     -------
     ndarray, shape (T, M) [m]
-        Smoothed codes; the raw code where there is no phase, and at the first epoch of an arc. Where the code is
-        missing, the smoothed code continues with the arc of the phase, and is NaN without an arc.
+        Smoothed codes. Without a phase, and at the first epoch of an arc, this is the raw code. Where the code is
+        missing, the smoothed code continues on the phase arc; it is NaN without an arc.
     SmoothingState
-        State for the next chunk. The division into chunks changes the result only by rounding (1e-9 m).
+        State for the next chunk. The division into chunks changes the result only by rounding errors (1e-9 m).
     """
     limits, state = limits or SmoothingLimits(), state or SmoothingState()
     channels = channel_keys(satellite, signal)
@@ -315,7 +314,7 @@ def smooth_codes(
         return code_m, state
     has_phase = np.isfinite(phase_m)
     has = has_phase & np.isfinite(code_m)
-    # An arc ends with its phase: without a phase, no arc continues into the next epoch.
+    # without a phase, no arc continues into the next epoch
     begins = slip | ~has_phase
     codes = np.cumsum(has, axis=0)
     before = _hold((codes - has).astype(np.float64), begins, -count0.astype(np.float64))
@@ -325,7 +324,7 @@ def smooth_codes(
     if limits.clocks == "own":
         apart = np.cumsum(np.r_[state.clock_m, _common_change(difference, begins, last0)])
     last, difference = difference[-1], difference - apart[1:, None]
-    # The arc's first code may come after its first phase.
+    # the first code of an arc may be later than its first phase
     base = _hold(difference, (has & (count == 1)) | begins, base0)
 
     dt = seconds(np.diff(np.concatenate([np.asarray([state.time], dtype="datetime64[ns]"), time])))

@@ -1,9 +1,9 @@
-"""Detection of phase jumps from the phase changes between two epochs on a known line, and numbering of phase arcs.
+"""Detection of phase jumps on a known line, and numbering of phase arcs.
 
-Between two epochs the unknowns are the distance moved along a known line and the change of the clock. Every additional
-satellite tests the phases to a centimetre. Where the satellites are inconsistent, the channels with the largest
-residuals are rejected one by one until the remaining channels agree. The number of an arc is unique in a run, and
-contains the letters of the channel and a count of arcs.
+Between two epochs, the unknowns are the distance moved along the line and the clock change. Every additional satellite
+tests the phases to a centimetre. Where the phase changes are inconsistent, the channels with the largest residuals are
+rejected one by one until the remaining channels agree. Arc numbers are unique in a run. They contain the letters of the
+channel and a count of its arcs.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from railfix.core.settings import Settings
 from railfix.core.timescale import seconds
 from railfix.track.trajectory import Trajectory
 
-#: Number of low bits of an arc number, which hold the count of arcs; the higher bits hold the channel's letters.
+#: Number of low bits of an arc number, which contain the count of arcs. The high bits contain the channel code.
 COUNT_BITS: Final = 23
 NO_ARC: Final = -1  #: Arc number where there is no phase.
 
@@ -30,23 +30,23 @@ ChannelKeys = tuple[tuple[str, str], ...]  #: Satellite and signal of each chann
 
 @dataclass(frozen=True, kw_only=True)
 class ArcState:
-    """Number of arcs so far, by channel code (`channel_code`)."""
+    """Number of arcs so far of each channel, by `channel_code`."""
 
     count: Mapping[int, int] = field(default_factory=dict)
 
 
 def channel_code(satellite: str, signal: str) -> int:
-    """Return the letters of a channel (satellite ``G05``, signal ``1C``) as a number."""
+    """Return the letters of a channel, such as satellite ``G05`` and signal ``1C``, as a number."""
     return int.from_bytes(f"{satellite:<3.3}{signal:<2.2}".encode("ascii"), "big")
 
 
 def channel_keys(satellite: Strings, signal: Strings) -> ChannelKeys:
-    """Return the satellite and signal of each channel, which identify channels in states."""
+    """Return the satellite and signal of each channel."""
     return tuple(zip(satellite.tolist(), signal.tolist(), strict=True))
 
 
 def rows_before(before: ChannelKeys, now: ChannelKeys) -> Indices:
-    """Return each channel's index in the previous epoch, shape (M,); -1 (index of an appended NaN) for new channels."""
+    """Return each channel's index in `before`, shape (M,); -1 for new channels."""
     row = {key: i for i, key in enumerate(before)}
     return np.array([row.get(key, -1) for key in now], dtype=np.intp)
 
@@ -59,7 +59,7 @@ def number_arcs(
     Parameters
     ----------
     slip : ndarray of bool, shape (T, M)
-        True where arcs begin (`find_slips`, and additional tests).
+        True where arcs begin.
     has_phase : ndarray of bool, shape (T, M)
     satellite, signal : ndarray of str, shape (M,)
     state : ArcState, optional
@@ -67,7 +67,7 @@ def number_arcs(
     Returns
     -------
     ndarray of int64, shape (T, M)
-        Number of each arc; `NO_ARC` without a phase.
+        Arc numbers; `NO_ARC` where there is no phase.
     ArcState
     """
     before = dict(state.count) if state else {}
@@ -81,7 +81,7 @@ def number_arcs(
 
 
 def last_arcs(satellite: Strings, signal: Strings, state: ArcState | None) -> Integers:
-    """Return the number of the last arc of each channel, shape (M,); `NO_ARC` for channels without an arc."""
+    """Return the number of each channel's last arc, shape (M,); `NO_ARC` for channels without an arc."""
     count = {} if state is None else state.count
     codes = [channel_code(*key) for key in channel_keys(satellite, signal)]
     return np.array([(code << COUNT_BITS) + count[code] if code in count else NO_ARC for code in codes], dtype=np.int64)
@@ -93,53 +93,53 @@ def decode_channel(arc_id: Integers) -> Integers:
 
 
 class ContinuityLimits(Settings):
-    """Limits of the test of phase changes."""
+    """Limits of the phase jump test."""
 
     phase_m: float = Field(default=0.012, gt=0)  #: Constant part of the standard deviation of a phase change.
-    #: Part of the standard deviation of a phase change that is proportional to the interval (satellite clocks, delays).
+    #: Part of the standard deviation of a phase change proportional to the interval (satellite clocks, delays).
     drift_mps: float = Field(default=0.008, gt=0)
-    #: Standard deviation of the motion across and up due to errors of map points, for any distance moved.
+    #: Constant part of the standard deviation of lateral and vertical motion, due to errors of map points.
     aside_m: float = Field(default=0.02, gt=0)
-    #: Standard deviation of the motion across due to the line's direction, as a fraction of the distance moved. A
-    #: position error of 5 m turns the line by 0.017 rad on a curve of 300 m radius.
+    #: Standard deviation of lateral motion due to direction errors, as a fraction of the distance moved. On a curve of
+    #: 300 m radius, a position error of 5 m is a direction error of 0.017 rad.
     across_share: float = Field(default=0.02, gt=0)
-    #: Standard deviation of the motion up, as a fraction of the distance moved. A position error of 5 m turns the line
-    #: by 0.0025 rad on a vertical curve of 2000 m.
+    #: Standard deviation of vertical motion due to gradient errors, as a fraction of the distance moved. On a vertical
+    #: curve of 2000 m radius, a position error of 5 m is a gradient error of 0.0025 rad.
     up_share: float = Field(default=0.003, gt=0)
-    sigmas: float = Field(default=4.5, gt=0)  #: Limit of a channel's residual, in standard deviations.
-    #: Largest number of channels rejected per epoch; if more disagree, all tested channels start new arcs.
+    sigmas: float = Field(default=4.5, gt=0)  #: Limit of a residual in standard deviations.
+    #: Largest number of channels rejected at an epoch. If more channels disagree, all tested channels start new arcs.
     max_rejected: int = Field(default=8, ge=0)
     max_gap_s: float = Field(default=31.0, gt=0)  #: Longest interval that is tested.
 
 
 @dataclass(frozen=True, kw_only=True)
 class ContinuityState:
-    """Phases, satellites and position of the last epoch of a chunk, by channel."""
+    """Phases, satellite positions and position on the line at the last epoch of a chunk."""
 
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     channels: ChannelKeys = ()
-    phase_m: Floats = field(default_factory=lambda: np.empty(0))  #: Corrected phase; NaN where not used; shape (M,).
+    phase_m: Floats = field(default_factory=lambda: np.empty(0))  #: Corrected phase, shape (M,); NaN if unused.
     sat_ecef_m: Floats = field(default_factory=lambda: np.empty((0, 3)))  #: Satellite positions, shape (M, 3).
     arc_m: float = float("nan")
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrackJumps:
-    """Test results for the phase changes since the previous epoch, T epochs by M channels."""
+    """Test results of phase changes since the previous epoch, T epochs by M channels."""
 
     jump: Masks  #: True where the phase change is inconsistent and a new arc begins, shape (T, M).
-    metric_m: Floats  #: Residual of the phase change in the fit of the kept channels; NaN if not tested; shape (T, M).
+    metric_m: Floats  #: Residual of the phase change in the fit of the kept channels, shape (T, M); NaN if untested.
     judged: Masks  #: True where the phase change is tested, shape (T, M).
-    moved_m: Floats  #: Distance along the line since the previous epoch, from phases; NaN where unknown; shape (T,).
-    moved_sigma_m: Floats  #: Standard deviation of `moved_m`; NaN where unknown; shape (T,).
+    moved_m: Floats  #: Distance moved along the line since the previous epoch, shape (T,); NaN if unknown.
+    moved_sigma_m: Floats  #: Standard deviation of `moved_m`, shape (T,); NaN if unknown.
 
 
 class TrackedPhases(NamedTuple):
     """Phases of T epochs by M channels."""
 
-    phase_m: Floats  #: Corrected phases (`observation_model.corrected_phase_m`), NaN where not used; shape (T, M).
-    sat_ecef_m: Floats  #: Satellite positions where there is a phase, shape (T, M, 3).
-    slip: Masks  #: Slips already detected, which are not tested; shape (T, M).
+    phase_m: Floats  #: Corrected phases (`observation_model.corrected_phase_m`), shape (T, M); NaN if unused.
+    sat_ecef_m: Floats  #: Satellite positions of the phases, shape (T, M, 3).
+    slip: Masks  #: True where a slip is already known and not tested, shape (T, M).
 
 
 def track_jumps(
@@ -153,7 +153,7 @@ def track_jumps(
     *,
     limits: ContinuityLimits | None = None,
 ) -> tuple[TrackJumps, ContinuityState]:
-    """Find phases that contradict the other phases and the line; compute the distance moved since the last epoch.
+    """Find phase changes that disagree with the other phases and the line; compute the distance moved.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ def track_jumps(
     phases : TrackedPhases
     trajectory : Trajectory
     arc_m : ndarray, shape (T,) [m]
-        Positions from codes alone, accurate to a few metres; epochs with NaN are not used.
+        Positions from codes alone, accurate to a few metres. Epochs with NaN are not used.
     state : ContinuityState, optional
     limits : ContinuityLimits, optional
 
@@ -218,10 +218,10 @@ def track_jumps(
 def _reject_jumps(
     design: Floats, change: Floats, judged: Masks, sigma: Floats, aside: Floats, limits: ContinuityLimits
 ) -> tuple[Masks, Floats, Floats, Floats, Masks]:
-    """Reject channels with the largest residuals one by one until the others agree; keep all without redundancy.
+    """Reject channels with the largest residuals one by one until the others agree.
 
-    Returns a mask of the kept channels, the residuals of all channels, the step along the line, the variance of the
-    step, and a mask of the epochs whose kept channels agree.
+    Return a mask of the kept channels, the residuals of all channels, the step along the line, the variance of the
+    step, and a mask of the epochs whose kept channels agree. Without redundancy, all channels are kept.
     """
     design = np.where(judged[..., None], design, 0.0)
     change = np.where(judged, change, 0.0)
@@ -235,7 +235,7 @@ def _reject_jumps(
     if len(at):
         part = design[at], change[at], sigma[at], prior[at]
         kept[at], decided[at] = _worst_out(*part, judged[at], limits)
-        # A channel that was rejected because of another channel's jump is accepted again.
+        # a channel that was rejected because of another channel's jump is accepted again
         back = judged[at] & (_fit(part[0], part[1], kept[at], part[2], part[3]).size <= limits.sigmas)
         kept[at], again = _worst_out(*part, back, limits)
         decided[at] &= again & (np.count_nonzero(judged[at] & ~kept[at], axis=1) <= limits.max_rejected)
@@ -245,7 +245,7 @@ def _reject_jumps(
 
 @dataclass(frozen=True)
 class _ContinuityFit:
-    """Fit of each epoch: residuals [m], their sizes [sigma], step along the line [m], and variance of the step."""
+    """Residuals [m], absolute residuals in sigmas, step along the line [m], and variance of the step."""
 
     residual: Floats
     size: Floats
@@ -262,7 +262,7 @@ def _fit(design: Floats, change: Floats, kept: Masks, sigma: Floats, prior: Floa
     residual = change - np.matmul(design, x[..., None])[..., 0]
     spread = np.einsum("tmi,tij,tmj->tm", design, inverse, design)
     own = sigma[:, None] ** 2
-    # A channel that no other channel tests has no residual variance, and cannot be tested.
+    # without redundancy, a channel has no residual variance and cannot be tested
     checked = np.where(kept, own - spread, own + spread)
     size = np.where(checked > 0.02 * own, np.abs(residual) / np.sqrt(np.maximum(checked, 1e-12)), 0.0)
     return _ContinuityFit(residual=residual, size=size, step=x[:, 0], variance=inverse[:, 0, 0])
@@ -271,7 +271,7 @@ def _fit(design: Floats, change: Floats, kept: Masks, sigma: Floats, prior: Floa
 def _worst_out(
     design: Floats, change: Floats, sigma: Floats, prior: Floats, kept: Masks, limits: ContinuityLimits
 ) -> tuple[Masks, Masks]:
-    """Reject the largest residual repeatedly; return the kept channels, and the epochs whose kept channels agree."""
+    """Repeatedly reject the largest residual; return masks of kept channels and of epochs at which these agree."""
     kept = kept.copy()
     active = np.arange(len(kept))
     for _ in range(limits.max_rejected + 1):

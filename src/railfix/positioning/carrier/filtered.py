@@ -1,8 +1,8 @@
-"""Positions along the line from code and phase; the position of an epoch depends on this and earlier epochs only.
+"""Positions along the line from code and phase of the current and earlier epochs.
 
-The state between epochs is the normal matrix of the ambiguities of the active arcs; at multiples of
-`PhaseLimits.hop_s` process noise is added to the ambiguities. Where an arc begins, the previous arc of its channel is
-eliminated, so that the state never has more arcs than channels.
+The state between epochs is the normal matrix of the ambiguities of the active arcs. Process noise is added to the
+ambiguities at multiples of `PhaseLimits.hop_s`. When an arc begins, the previous arc of its channel is eliminated, so
+that the state never has more arcs than channels.
 """
 
 from __future__ import annotations
@@ -40,21 +40,21 @@ from railfix.positioning.carrier.observation_model import (
 from railfix.positioning.range_arrays import Ranges
 from railfix.track.trajectory import Trajectory
 
-SEGMENT_EPOCHS: Final = 64  #: Number of epochs computed together, which limits the use of memory.
+SEGMENT_EPOCHS: Final = 64  #: Number of epochs computed together. It limits memory usage.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Memory:
-    """Information on A active arcs, summed over the epochs so far."""
+    """Information on A active arcs from all epochs so far."""
 
     #: Time of the last epoch, NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     arc_id: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))  #: Number of each arc, shape (A,).
     #: Time of the last phase of each arc, shape (A,).
     seen: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))
-    first_m: Floats = field(default_factory=lambda: np.empty(0))  #: First values of the ambiguities, shape (A,).
+    first_m: Floats = field(default_factory=lambda: np.empty(0))  #: First value of each ambiguity, shape (A,).
     matrix: Floats = field(default_factory=lambda: np.empty((0, 0)))  #: Normal matrix, shape (A, A) [1/m^2].
-    #: Right-hand sides of the observations, and of map errors of 1 m across and in height; shape (A, 3) [1/m].
+    #: Right-hand sides for the observations and for map errors of 1 m across and in height, shape (A, 3) [1/m].
     right: Floats = field(default_factory=lambda: np.empty((0, 3)))
 
 
@@ -75,7 +75,7 @@ def phase_positions(
     *,
     limits: PhaseLimits | None = None,
 ) -> tuple[PhasePositions, PhaseState]:
-    """Compute the position of each epoch of a chunk from the observations up to this epoch.
+    """Compute the position of each epoch of a chunk from the observations up to the epoch.
 
     Parameters
     ----------
@@ -83,10 +83,11 @@ def phase_positions(
     ranges : Ranges
         Corrected codes with weights, satellite positions, clock groups and inter-system biases.
     phases : Phases
-        Corrected phases with arcs from `number_arcs`; only the newest arc of a channel is active.
+        Corrected phases with arc numbers (`number_arcs`). Only the newest arc of a channel is active.
     trajectory : Trajectory
     arc_m_start : ndarray, shape (T,) [m]
-        Initial position of each epoch (the constrained position from codes alone); an epoch with NaN is left out.
+        Initial position of each epoch, which is the constrained position from codes alone. Epochs with NaN are not
+        used.
     state : PhaseState, optional
     limits : PhaseLimits, optional
 
@@ -103,7 +104,7 @@ def phase_positions(
     started = np.isfinite(arc_m_start)
     ranges, phases, arc = prepare_start(ranges, phases, trajectory, arc_m_start)
     cuts = _cuts(number_hops(time, limits))
-    integers, phases = phases.integers, replace(phases, integers=None)  # integers are fixed in the last pass only
+    integers, phases = phases.integers, replace(phases, integers=None)  # integers are fixed only in the last pass
     after: list[Memory] = []
     pieces: list[PhasePositions] = []
     for number, before in enumerate(memories, 1):
@@ -123,7 +124,7 @@ def phase_positions(
 
 
 def _cuts(hop: Integers) -> list[Indices]:
-    """Divide epochs into segments of at most `SEGMENT_EPOCHS` epochs, each within one time step of the random walk."""
+    """Divide epochs into segments of at most `SEGMENT_EPOCHS` epochs within one time step of the random walk."""
     blocks = np.arange(0, len(hop), SEGMENT_EPOCHS)
     starts = np.union1d(np.flatnonzero(np.diff(hop)) + 1, blocks)
     return np.split(np.arange(len(hop)), starts[1:])
@@ -138,7 +139,7 @@ def _segment(
     memory: Memory,
     limits: PhaseLimits,
 ) -> tuple[PhasePositions, Floats, Memory]:
-    """Compute the positions of one segment, and the memory after it; `start` has initial positions and their mask."""
+    """Return the positions of one segment, the arc lengths for the next linearisation, and the memory after it."""
     arc_m, started = start
     used = phases.weight > 0
     lin = linearise(ranges, phases, trajectory, arc_m, clocks=limits.clocks)
@@ -154,7 +155,7 @@ def _segment(
     lin = shift_phases(lin, base)
     matrix, right = reduce(lin)
 
-    # A part ends where an arc begins, so that the size of matrices does not depend on the division into segments.
+    # a part ends where an arc begins, so that matrix sizes do not depend on the division into segments
     parts = []
     for part in np.split(np.arange(len(time)), np.unique(begin[begin > 0])):
         new = np.isin(begin, part[:1])
@@ -182,14 +183,14 @@ def _segment(
 def _ambiguities(
     matrix: Floats, right: Floats, arc_id: Integers, memory: Memory, *, held: bool
 ) -> tuple[Floats, Floats, ArcAmbiguities, Memory]:
-    """Return ambiguities of each epoch's channels minus their first values, shape (T, M, 3), and covariances (T, M, M).
+    """Return the ambiguities of each epoch's channels minus their first values, their covariances, arcs and memory.
 
-    The ambiguities are computed from the normal equations of each epoch and all earlier epochs. The ambiguities of all
-    arcs, and the memory after the last epoch, are also returned. With `held` the ambiguities have a zero mean
+    The shapes are (T, M, 3) and (T, M, M). The ambiguities are computed from the normal equations of the epoch and all
+    earlier epochs. Arcs and memory are those after the last epoch. With `held`, the mean of the ambiguities is zero
     (`inverse_of_arcs`).
     """
     count, row = len(memory.arc_id), np.arange(len(arc_id))[:, None]
-    # An extra row and column collects channels without a phase.
+    # channels without a phase are collected in an extra row and column
     index = np.where(arc_id == NO_ARC, count, np.searchsorted(memory.arc_id, arc_id))
     if (np.append(memory.arc_id, NO_ARC)[index] != arc_id).any():
         raise ValueError("an arc has phases after the start of a newer arc of its channel; assign arcs by number_arcs")
@@ -198,7 +199,7 @@ def _ambiguities(
     own[row, index, count + 1 :] = right
     own = np.delete(own[:, :count], count, axis=2)
     carried = np.concatenate([memory.matrix, memory.right], axis=1)
-    # With cumsum, the additions and their order do not depend on the division into chunks.
+    # with cumsum, the order of the additions does not depend on the division into chunks
     sums = np.cumsum(np.concatenate([carried[None], own]), axis=0)
     after = replace(memory, matrix=sums[-1, :, :count], right=sums[-1, :, count:])
     level = np.zeros((len(arc_id), count + 1))
@@ -216,10 +217,10 @@ def _ambiguities(
 def _fix_epochs(
     floats: tuple[Floats, Floats, Floats], phases: Phases, trajectory: Trajectory, limits: PhaseLimits
 ) -> tuple[Integers, Floats]:
-    """Fix ambiguities in place, epoch by epoch; return the numbers of fixed differences and the risks, shape (T,) each.
+    """Fix the ambiguities of each epoch in place; return `PhasePositions.n_fixed` and `PhasePositions.integer_risk`.
 
-    `floats` are the first values of each channel's ambiguity (T, M), the corrections to these values with their
-    responses to the map (T, M, 3), and the covariances (T, M, M).
+    `floats` are the first values of each channel's ambiguity (T, M), the corrections to these values and their changes
+    for map errors of 1 m (T, M, 3), and the covariances (T, M, M).
     """
     first, value, covariance = floats
     count, risk = np.zeros(len(value), dtype=np.int64), np.full(len(value), np.nan)
@@ -244,7 +245,7 @@ def _fix_epochs(
 
 
 def _with_arcs(memory: Memory, ids: Integers, first_m: Floats) -> Memory:
-    """Return the memory with rows for new arcs, sorted by number; older arcs of the same channels are eliminated."""
+    """Return the memory after adding new arcs, sorted by number; older arcs of the same channels are eliminated."""
     if not len(ids):
         return memory
     memory = _without(memory, np.isin(decode_channel(memory.arc_id), decode_channel(ids)))
@@ -265,7 +266,7 @@ def _with_arcs(memory: Memory, ids: Integers, first_m: Floats) -> Memory:
 
 
 def _walk(memory: Memory, time: Datetimes, limits: PhaseLimits) -> Memory:
-    """Return the memory at the time step of `time`: absent arcs are eliminated, and the others get process noise."""
+    """Return the memory at the time step of `time`: absent arcs are eliminated, and process noise is added."""
     if not len(time) or not len(memory.arc_id):
         return memory
     before, now = number_hops(np.array([memory.time, time[0]]), limits)
@@ -274,7 +275,7 @@ def _walk(memory: Memory, time: Datetimes, limits: PhaseLimits) -> Memory:
     begin = GPS_EPOCH + np.timedelta64(int(now) * round(limits.hop_s * 1e9), "ns")
     memory = _without(memory, seconds(begin - memory.seen) > FORGET_S)
     variance = limits.drift_m**2 * float(now - before) * limits.hop_s
-    # (Lambda^-1 + v I)^-1 = (I + v Lambda)^-1 Lambda, which is valid even if Lambda is singular.
+    # (Lambda^-1 + v I)^-1 = (I + v Lambda)^-1 Lambda; the right side exists even if Lambda is singular
     both = np.concatenate([memory.matrix, memory.right], axis=1)
     both = np.linalg.solve(np.eye(len(both)) + variance * memory.matrix, both)
     matrix, right = both[:, : len(both)], both[:, len(both) :]
@@ -282,7 +283,7 @@ def _walk(memory: Memory, time: Datetimes, limits: PhaseLimits) -> Memory:
 
 
 def _without(memory: Memory, ends: Masks) -> Memory:
-    """Return the memory with some arcs eliminated; the information on the other arcs is unchanged."""
+    """Return the memory after eliminating the arcs marked by `ends`; the information on the other arcs is unchanged."""
     runs = ~ends
     if runs.all():
         return memory
@@ -302,7 +303,7 @@ def _without(memory: Memory, ends: Masks) -> Memory:
 
 
 def _join(pieces: list[PhasePositions]) -> PhasePositions:
-    """Concatenate segments; the arcs are taken from the last segment."""
+    """Concatenate segments; `arcs` are those of the last segment."""
     arrays: dict[str, Any] = {
         item.name: np.concatenate([getattr(p, item.name) for p in pieces])
         for item in fields(PhasePositions)

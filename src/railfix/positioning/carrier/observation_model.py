@@ -1,16 +1,17 @@
-"""Linearised observation equations of P4, with the unknowns of each epoch eliminated.
+"""Linearised observation equations of P4, and elimination of each epoch's own unknowns.
 
-Per epoch t and channel i, around a position on the line::
+For each epoch and channel, at a position on the line::
 
     code  - range = -u.e d + (-u.c m1 - u.h m2) + b_g
     phase - range = -u.e d + (-u.c m1 - u.h m2) + b   + N_arc
 
-where d is the distance along the section, m1 and m2 are the map errors across the track and in height, and b_g is the
-clock of the constellation. P4 sets b = b_g (`clocks="shared"`), which does not hold for telephones. With a separate
-phase clock, the N are determined up to a common constant. Let ``L`` be the normal matrix of an epoch's own unknowns,
-and ``C`` their coupling to the N. The epoch then adds ``diag(w) - C^T L^-1 C`` to the normal matrix of the N (Schur
-complement). N absorbs the residual ionospheric error at the start of an arc; afterwards N drifts by twice the change of
-this error.
+Here, u is the unit vector to the satellite, and e, c and h are the unit vectors along, across and up. d is the distance
+along the section, m1 and m2 are the lateral and vertical map errors, and b_g is the clock of the constellation. P4
+assumes b = b_g (`clocks="shared"`), which is wrong for telephones. With a separate phase clock b, the ambiguities N are
+determined except for a common constant. Let ``L`` be the normal matrix of an epoch's own unknowns, and ``C`` their
+coupling to the ambiguities. The epoch then adds ``diag(w) - C^T L^-1 C`` to the normal matrix of the ambiguities (Schur
+complement). N absorbs the residual ionospheric error at the start of an arc. Afterwards, N drifts by twice the change
+of this error.
 """
 
 from __future__ import annotations
@@ -27,78 +28,78 @@ from railfix.track.trajectory import Trajectory
 
 PhaseClocks = Literal["own", "shared"]
 
-PLACE: Final = 3  #: Number of own unknowns of an epoch before the clocks: along, across, up.
-_FREE_M: Final = 1e5  #: Prior sigma of an unknown, a loose prior for conditioning [m].
-_LEAST_TIE_M: Final = 1e-2  #: Minimum sigma of an inter-system bias that ties two clocks [m].
+PLACE: Final = 3  #: Number of position unknowns of an epoch: along, across, up.
+_FREE_M: Final = 1e5  #: Loose prior sigma of an unknown, for conditioning [m].
+_LEAST_TIE_M: Final = 1e-2  #: Minimum sigma of an inter-system bias [m].
 
 
 @dataclass(frozen=True, kw_only=True)
 class IntegerChannels:
-    """Channels whose ambiguities differ by whole cycles."""
+    """Channels whose ambiguities differ by integers of cycles."""
 
-    wavelength_m: Floats  #: Shape (M,).
-    group: Integers  #: Group of channels with the same clock and signal; -1 without integer ambiguities; shape (M,).
+    wavelength_m: Floats  #: Carrier wavelength of each channel, shape (M,).
+    group: Integers  #: Group of channels with equal clock and signal, shape (M,); -1 for real-valued ambiguities.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Phases:
-    """Corrected phases of an antenna for its `Ranges`: T epochs by M channels."""
+    """Corrected phases of an antenna, T epochs by M channels as in its `Ranges`."""
 
-    #: Carrier phase [m], corrected like the code (`corrected_phase_m`); arbitrary where the weight is 0; shape (T, M).
+    #: Carrier phase (`corrected_phase_m`), shape (T, M); arbitrary where the weight is 0.
     phase_m: Floats
-    #: 1/sigma^2 [1/m^2]; 0 for unused phases; shape (T, M). `Ranges.sat_ecef_m` must be valid where the weight is
-    #: positive.
+    #: Weight 1/sigma^2, shape (T, M) [1/m^2]; 0 for unused phases. `Ranges.sat_ecef_m` must be valid for used phases.
     weight: Floats
-    #: Number of the arc of each phase, unique in a run; constant while a channel's phase is unbroken; shape (T, M).
+    #: Arc number of each phase, shape (T, M), unique in a run and constant while the channel has no slip or gap.
     arc_id: Integers
-    integers: IntegerChannels | None = None  #: Channels with integer ambiguities; None if all are real-valued.
+    integers: IntegerChannels | None = None  #: Integer ambiguities; None if all are real-valued.
 
     def take(self, epochs: Masks | Indices | slice) -> Phases:
-        """Return the phases of some epochs."""
+        """Return the phases of selected epochs."""
         arrays = {name: getattr(self, name)[epochs] for name in ("phase_m", "weight", "arc_id")}
         return replace(self, **arrays)
 
 
 def corrected_phase_m(phase_m: Floats, sat_clock_m: Floats, ionosphere_m: Floats, troposphere_m: Floats) -> Floats:
-    """Return the phase corrected so that geometry, receiver clock and a constant remain, shape (T, M) [m].
+    """Return phases that contain only geometry, receiver clock and a constant, shape (T, M) [m].
 
     Parameters
     ----------
     phase_m : ndarray, shape (T, M) [m]
         `Slips.phase_m`.
     sat_clock_m : ndarray, shape (T, M) [m]
-        c times the satellite clock. Group delays of the phase are constant on an arc and are not corrected.
+        c times the satellite clock error. Group delays are not corrected, because they are constant on an arc.
     ionosphere_m, troposphere_m : ndarray, shape (T, M) [m]
-        Delays of the code; the ionosphere advances the phase by the same amount.
+        Delays of the code. The ionosphere advances the phase by the same distance.
     """
     return phase_m + sat_clock_m + ionosphere_m - troposphere_m
 
 
 @dataclass(frozen=True, kw_only=True)
 class Linearised:
-    """Linearised equations of T epochs; each epoch has P unknowns ``x = [along, across, up, clocks]`` of its own."""
+    """Linearised equations of T epochs. Each epoch has P own unknowns ``x = [along, across, up, clocks]``."""
 
     code_design: Floats  #: Design rows of the codes, shape (T, M, P).
     phase_design: Floats  #: Design rows of the phases, shape (T, M, P).
-    groups: int  #: Number of code clocks; a separate phase clock follows them.
+    groups: int  #: Number of code clocks. A separate phase clock is the last unknown.
     code_weight: Floats  #: Weights of the codes, shape (T, M) [1/m^2].
     phase_weight: Floats  #: Weights of the phases, shape (T, M) [1/m^2].
-    code_m: Floats  #: Observed minus computed code, minus `clock_m`; shape (T, M).
-    phase_m: Floats  #: Observed minus computed phase, minus `phase_clock_m`; shape (T, M).
-    clock_m: Floats  #: Approximate clock of the epoch, subtracted from the codes; shape (T,).
-    phase_clock_m: Floats  #: Approximate clock of the epoch, subtracted from the phases; shape (T,).
+    code_m: Floats  #: Observed minus computed code minus `clock_m`, shape (T, M).
+    phase_m: Floats  #: Observed minus computed phase minus `phase_clock_m`, shape (T, M).
+    clock_m: Floats  #: Approximate receiver clock of the codes, shape (T,).
+    phase_clock_m: Floats  #: Approximate receiver clock of the phases, shape (T,).
     known: Floats  #: Prior information on map errors and inter-system biases, shape (T, P, P).
     inverse: Floats  #: Inverse of the normal matrix of each epoch's own unknowns, shape (T, P, P).
-    #: Right-hand side of each epoch's own unknowns; codes alone until `shift_phases` adds the phases; shape (T, P).
+    #: Right-hand side of each epoch's own unknowns, shape (T, P). It contains only codes until `shift_phases` adds
+    #: phases.
     right: Floats
-    coupling: Floats  #: Normal matrix between own unknowns and each channel's ambiguity, shape (T, P, M).
-    prior: Floats  #: Prior information on the map errors across and in height, shape (2,) [1/m^2].
+    coupling: Floats  #: Normal matrix block of own unknowns and ambiguities, shape (T, P, M).
+    prior: Floats  #: Prior information on lateral and vertical map errors, shape (2,) [1/m^2].
 
 
 def linearise(
     ranges: Ranges, phases: Phases, trajectory: Trajectory, arc_m: Floats, *, clocks: PhaseClocks = "own"
 ) -> Linearised:
-    """Linearise the observation equations at finite arc lengths `arc_m`, shape (T,)."""
+    """Linearise the observation equations at arc lengths `arc_m`, shape (T,), which must be finite."""
     section, along = trajectory.segment_at(arc_m)
     place = trajectory.ecef_m[section] + along[:, None] * trajectory.tangent[section]
     distance, los = range_with_rotation(ranges.sat_ecef_m, place[:, None, :])
@@ -117,7 +118,7 @@ def linearise(
     phase = np.where(v > 0, phases.phase_m - distance - clock[:, None], 0.0)
     prior = np.array([trajectory.sigma_plan_m**-2.0, trajectory.sigma_height_m**-2.0])
     known = np.zeros((len(code), unknowns, unknowns))
-    # With the loose prior, the matrix is regular even where an epoch does not determine an unknown.
+    # the loose prior makes the matrix regular even where an epoch does not determine an unknown
     for free in (0, *range(PLACE, unknowns)):
         known[:, free, free] = _FREE_M**-2.0
     known[:, 1, 1], known[:, 2, 2] = prior
@@ -147,7 +148,7 @@ def linearise(
 
 
 def _level(values: Floats, weight: Floats) -> tuple[Floats, Floats]:
-    """Return the values minus each epoch's weighted mean (0 where the weight is 0), and the means, shape (T,)."""
+    """Return the values minus each epoch's weighted mean, 0 where the weight is 0, and the means, shape (T,)."""
     used = np.where(weight > 0, values, 0.0)
     total = weight.sum(axis=1)
     mean = (weight * used).sum(axis=1) / np.where(total > 0, total, 1.0)
@@ -163,12 +164,12 @@ def _ties(ties: InterSystemBiases) -> tuple[Floats, Floats]:
 
 
 def own_clock(lin: Linearised) -> bool:
-    """Return whether the phases have a separate clock."""
+    """Return True if the phases have a separate clock."""
     return bool(lin.phase_design.shape[-1] > PLACE + lin.groups)
 
 
 def shift_phases(lin: Linearised, first_m: Floats) -> Linearised:
-    """Subtract first values of the ambiguities (T, M), and of a separate phase clock, from the phases.
+    """Subtract the first values of the ambiguities, shape (T, M), and a separate phase clock from the phases.
 
     The phases are added to the right-hand side of the equations only after this subtraction, because values of 1e7 m
     would cause rounding errors of millimetres.
@@ -182,15 +183,15 @@ def shift_phases(lin: Linearised, first_m: Floats) -> Linearised:
 
 
 def reduce(lin: Linearised) -> tuple[Floats, Floats]:
-    """Compute each epoch's information on the ambiguities, with the epoch's own unknowns eliminated (Schur complement).
+    """Return each epoch's information on the ambiguities after eliminating its own unknowns (Schur complement).
 
-    Returns normal matrices (T, M, M) [1/m^2] and right-hand sides (T, M, 3) [1/m] of the observations, and of map
-    errors of 1 m across and in height. A map error changes code and phase equally, by a column of the design; with the
-    prior of the map error, the right-hand side is ``prior_k C^T L^-1 e_k``.
+    The results are normal matrices (T, M, M) [1/m^2] and right-hand sides (T, M, 3) [1/m] for the observations and for
+    map errors of 1 m across and in height. A map error changes code and phase equally, by a column of the design. With
+    the prior of this map error, the right-hand side is ``prior_k C^T L^-1 e_k``.
     """
     gain = np.matmul(lin.inverse, lin.coupling)
-    # A sum of squared residuals is never negative, and squares the errors of the inverse. In contrast, diag(v) - C^T
-    # L^-1 C would lose all digits where an epoch has little information.
+    # The sum of squared residuals is never negative, and the errors of the inverse enter squared. In contrast, diag(v)
+    # - C^T L^-1 C would lose all digits where an epoch has little information.
     left = [
         (lin.code_weight, -np.matmul(lin.code_design, gain)),
         (lin.phase_weight, np.eye(gain.shape[2]) - np.matmul(lin.phase_design, gain)),
@@ -209,12 +210,12 @@ def reduce(lin: Linearised) -> tuple[Floats, Floats]:
 class OwnUnknowns:
     """Solution for each epoch's own unknowns, given the ambiguities."""
 
-    step_m: Floats  #: Distance along the line from the point of linearisation, shape (T,).
-    noise_sigma_m: Floats  #: Standard deviation due to noise alone, shape (T,).
-    sigma_m: Floats  #: Standard deviation, including the map error; shape (T,).
+    step_m: Floats  #: Position along the line minus linearisation position, shape (T,).
+    noise_sigma_m: Floats  #: Standard deviation of `step_m` due to noise alone, shape (T,).
+    sigma_m: Floats  #: Standard deviation of `step_m`, including the map error, shape (T,).
     clock_m: Floats  #: Receiver clock of each group, shape (T, G).
-    code_residual_m: Floats  #: Observed minus computed code; 0 where the weight is 0; shape (T, M).
-    phase_residual_m: Floats  #: Observed minus computed phase; 0 where the weight is 0; shape (T, M).
+    code_residual_m: Floats  #: Observed minus computed code, shape (T, M); 0 if unused.
+    phase_residual_m: Floats  #: Observed minus computed phase, shape (T, M); 0 if unused.
 
 
 def own_unknowns(
@@ -222,19 +223,20 @@ def own_unknowns(
 ) -> OwnUnknowns:
     """Solve for each epoch's own unknowns by back-substitution.
 
-    `ambiguity_m`, shape (T, M, 3), are each channel's ambiguity and its responses to map errors of 1 m across and in
-    height. A map error that is constant over a run does not average out, so the sigma contains the larger of two
-    responses: the response of the epoch alone, and the response with the ambiguities. `repeats`, shape (T,), are the
-    numbers of epochs with the same code errors; they multiply the ambiguities' variance.
+    `ambiguity_m`, shape (T, M, 3), are each channel's ambiguity and its changes for map errors of 1 m across and in
+    height. A map error that is constant over a run does not average out. The sigma therefore contains the larger of two
+    effects of the map error: the effect with given ambiguities, and the effect that also acts through the ambiguities.
+    `repeats`, shape (T,), are the numbers of epochs with equal code errors; they multiply the variance of the
+    ambiguities.
     """
     used = lin.phase_weight > 0
     known = np.where(used[..., None], ambiguity_m, 0.0)
     x = np.matmul(lin.inverse, (lin.right - np.matmul(lin.coupling, known[..., :1])[..., 0])[..., None])[..., 0]
-    # Response of the distance along the line to the ambiguities, and to the map.
+    # derivatives of the position along the line with respect to the ambiguities
     row = -np.matmul(lin.inverse[:, :1], lin.coupling)[:, 0]
     from_arcs = np.einsum("ti,tij,tj->t", row, covariance_m2, row)
     from_noise = lin.inverse[:, 0, 0] + from_arcs
-    # With fully correlated code errors the phases do not reduce the sigma.
+    # if code errors are fully correlated, the phases do not reduce the sigma
     by_codes = np.matmul((lin.code_design * lin.code_weight[..., None]).swapaxes(1, 2), lin.code_design)
     most = np.maximum(np.linalg.inv(by_codes + lin.known)[:, 0, 0], from_noise)
     from_noise = np.minimum(lin.inverse[:, 0, 0] + repeats * from_arcs, most)
