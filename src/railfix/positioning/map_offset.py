@@ -68,9 +68,8 @@ class MapOffsetState:
     #: Time of the last epoch; NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     age: float = 0.0  #: Age of the last epoch since the start of the log, in windows of `window_s`.
-    #: Nine sums over the epochs on the map, then the same sums over the epochs off the map, shape (18,). The nine sums
-    #: are the information matrix (across, mixed, up), information times offset (2), covariance of satellite and
-    #: atmospheric errors (3), and number of samples.
+    #: Nine sums for epochs on the map, then nine for epochs off the map, shape (18,): information matrix (3),
+    #: information times offset (2), covariance of satellite and atmospheric errors (3), and number of samples.
     sums: Floats = field(default_factory=lambda: np.zeros(2 * _SUMS))
 
 

@@ -1,10 +1,9 @@
 """Receiver noise scale and single-epoch sigma.
 
 A noise scale is the ratio of the actual to the assumed standard deviation of ranges. Two scales are estimated from
-earlier epochs, as root mean squares with exponential forgetting. The robust scale is estimated from the ranges that
-agree with each other. It is used in the RAIM test and does not depend on the results of RAIM. The stated scale is
-estimated from the ranges accepted by RAIM, and is used in sigmas and protection levels. Epochs with unresolved faults
-and epochs off the map contribute to neither scale.
+earlier epochs, with exponential forgetting. The robust scale, from ranges that agree with each other, is used in the
+RAIM test and does not depend on the results of RAIM. The stated scale, from ranges accepted by RAIM, is used in sigmas
+and protection levels. Epochs with unresolved faults and epochs off the map contribute to neither scale.
 """
 
 from __future__ import annotations

@@ -165,9 +165,8 @@ def ionosphere_free(
 ) -> Combined:
     """Return the ionosphere-free combination of two codes; the test of their difference is unchanged.
 
-    The combination is ``P = (ratio P1 - P2) / (ratio - 1)``. Its noise is not smoothed over epochs. `delays_m` are the
-    group delays, shape (T, K), contained in the corrections of the first and the second code; they are added back.
-    `found` is the result of `combine_codes`.
+    The combination is ``P = (ratio P1 - P2) / (ratio - 1)``. `delays_m` are the group delays in the corrections of the
+    two codes, shape (T, K); they are added back. `found` is the result of `combine_codes`.
     """
     share = np.where(np.isfinite(code_m + second.code_m), -1.0 / (second.ratio - 1.0), np.nan)
     first, other = code_m + delays_m[0], second.code_m + delays_m[1]
@@ -181,8 +180,7 @@ def ionosphere_free(
 def share_of_second(first_m2: Floats, second_m2: Floats, ratio: Floats, ionosphere_m2: Floats) -> tuple[Floats, Floats]:
     """Return the least-squares weight of the second code, and the variance of the code difference.
 
-    The variances `first_m2` and `second_m2` of the codes exclude the ionosphere. A large `ionosphere_m2` results in the
-    ionosphere-free combination.
+    The code variances `first_m2` and `second_m2` exclude the ionosphere.
     """
     total = first_m2 + second_m2 + (ratio - 1.0) ** 2 * ionosphere_m2
     return (first_m2 - (ratio - 1.0) * ionosphere_m2) / total, total

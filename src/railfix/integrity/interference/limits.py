@@ -73,8 +73,7 @@ CAUSES: Final = tuple(cause for cause in Sign if cause)  #: All signs but NONE, 
 class InterferenceLimits(Settings):
     """Limits of the interference tests.
 
-    With the default limits, no sign occurs on the test recordings. The file
-    ``tests/references/results/interference.txt`` lists the largest statistics of these recordings.
+    With the defaults, the test recordings have no sign; see ``tests/references/results/interference.txt``.
     """
 
     use: Literal["on", "off"] = "on"
@@ -155,9 +154,9 @@ def cause_text(causes: Bits) -> Strings:
 def suspicion(causes: Bits) -> Codes:
     """Return the `Suspicion` of each epoch from its signs.
 
-    If several suspicions are possible, the first in a fixed order is returned. A time-tag error comes first, because it
-    displaces positions and clocks as a spoofer does. Spoofing precedes leaving the map, because leaving the map
-    explains neither jumps nor equal C/N0 nor differing constellations.
+    The first possible suspicion in a fixed order is returned. A time-tag error comes first, because it displaces
+    positions and clocks as a spoofer does. Spoofing precedes leaving the map, which explains neither jumps nor equal
+    C/N0.
     """
     order = (
         (Sign.TIME_TAGS, Suspicion.TIME_TAGS), (_SPOOFING, Suspicion.SPOOFING_SUSPECTED),

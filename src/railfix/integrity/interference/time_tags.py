@@ -62,10 +62,9 @@ def fit_time_tags(inputs: MotionInputs) -> tuple[Floats, Floats]:
     """Return the common time-tag error, positive for late time tags, and its standard deviation, shape (T,) [s].
 
     The fit includes satellites that were rejected as faulty, because a time-tag error makes satellites appear faulty.
-    Where the time-tag error is significant or the position is doubtful, the fit is repeated with the line as a
-    constraint and compared with a fit without a time-tag error and without the rejected satellites. If the time-tag
-    error does not explain the residuals clearly better, its standard deviation is infinite. Both values are NaN where
-    they cannot be determined.
+    If the error is significant or the position doubtful, the fit is repeated with the line as a constraint and compared
+    with a fit without a time-tag error and rejected satellites. If the time-tag error does not explain the residuals
+    clearly better, its standard deviation is infinite. Both values are NaN where undetermined.
     """
     near, every = inputs.near_ecef_m, inputs.used | inputs.named
     error, sigma, place, _ = _fit(inputs, every, np.zeros(len(near)), near, tags=True, line=False)
@@ -80,10 +79,7 @@ def fit_time_tags(inputs: MotionInputs) -> tuple[Floats, Floats]:
 
 
 def _explains_more(inputs: MotionInputs, with_error: Floats, without: Floats) -> Masks:
-    """Return True where a time-tag error explains the residuals clearly better than faulty codes, shape (T,).
-
-    The cost compared is the sum of squared normalised residuals of codes and line, each clipped at `_AGREES`.
-    """
+    """Return True where a time-tag error explains the residuals clearly better than faulty codes, shape (T,)."""
     every = inputs.used | inputs.named
     rows, clocks = _with_line(every, True), (clock_columns(inputs) * every[..., None]).any(axis=1).sum(axis=1)
     # without redundancy, the accepted ranges fit exactly, and the rejected ranges count as faulty

@@ -1,11 +1,8 @@
 """Detection of slow spoofing along the track from GNSS and wheel distances.
 
-The GNSS distance is the difference between two GNSS positions along the line. Slow spoofing pulls the position away
-from the true position, so that the GNSS distance deviates from the wheel distance.
-
-Without spoofing, the two distances over a window differ by the noise of two positions and by the wheel scale-factor
-error, which is estimated from the data before the window. Spoofing that begins with the run, or that stays within the
-uncertainty of the wheel scale factor, is not detected.
+The GNSS distance is the difference between two GNSS positions along the line. Without spoofing, it differs from the
+wheel distance by position noise and the wheel scale-factor error, which is estimated from the data before the window.
+Spoofing that begins with the run, or stays within the uncertainty of the scale factor, is not detected.
 """
 
 from __future__ import annotations
@@ -66,9 +63,8 @@ class WheelSigns:
 
     #: GNSS distance minus scaled wheel distance over the window, shape (T,); NaN where not compared.
     difference_m: Floats
-    #: Bound of the position error caused by spoofing that began within the window, shape (T,). The bound is the
-    #: absolute difference plus `wheel_level_sigmas` standard deviations. This standard deviation combines the position
-    #: at the window start with the wheel distance. Windows shorter than `wheel_least_s` also have a bound.
+    #: Bound of the position error caused by spoofing that began within the window, shape (T,): absolute difference plus
+    #: `wheel_level_sigmas` standard deviations of the position at the window start and of the wheel distance.
     bound_m: Floats
     #: True where the difference exceeds its limits, or exceeded them within the release time; shape (T,).
     parted: Masks
@@ -144,10 +140,7 @@ def _compare(
 ) -> tuple[Floats, Floats, Masks]:
     """Compare GNSS and wheel distances over the window before each sample, beginning with sample `first`.
 
-    Return differences, bounds, and a mask of differences that exceed their limits. The wheel distance is corrected by
-    the scale factor estimated from the data before each window.
-
-
+    Return differences, bounds, and a mask of differences that exceed their limits.
     """
     time = seconds(samples.time - samples.time[0]) if len(samples.time) else np.empty(0)
     now = np.arange(first, len(time))

@@ -108,9 +108,8 @@ class MapDeviation(NamedTuple):
     """Lateral and vertical map error in addition to the map sigmas."""
 
     bias_m: ArrayLike = 0.0  #: Map offset not covered by the map sigmas, shape (T, 2) or (2,).
-    #: Lateral and vertical offset from the map of the antenna position computed without the map, shape (T, 2) [m], and
-    #: inverse covariance of this offset, shape (T, 2, 2) [1/m^2] (0 if unknown). If present, a wrong map is a
-    #: hypothesis with the prior `RiskBudget.map_prior`.
+    #: Lateral and vertical offset of the 3-D position from the map, shape (T, 2) [m], and its inverse covariance, shape
+    #: (T, 2, 2) [1/m^2] (0 if unknown). If present, a wrong map is a hypothesis.
     seen: tuple[Floats, Floats] | None = None
 
 
@@ -148,7 +147,7 @@ def protection_level(
     ------
     ValueError
         The model is not on the line, the noise scale is not positive, `systems` does not name each channel, or the
-        model contains a satellite excluded according to `n_excluded`.
+        model uses an excluded satellite.
     """
     if model.interest != 1:
         raise ValueError("a level along the track needs a model on the line (linear_model)")

@@ -40,7 +40,7 @@ from railfix.positioning.carrier.observation_model import (
 from railfix.positioning.range_arrays import Ranges
 from railfix.track.trajectory import Trajectory
 
-SEGMENT_EPOCHS: Final = 64  #: Number of epochs computed together. It limits memory usage.
+SEGMENT_EPOCHS: Final = 64  #: Number of epochs computed together.
 
 
 @dataclass(frozen=True, kw_only=True)
