@@ -80,21 +80,21 @@ class HeldFrame:
         return f"its motion relative to the plate, {low:.2f} to {high:.2f} m, is left out{but}"
 
 
-_ANDES: Final = "as are earthquakes, metres in Chile since 2010"
+_ANDES: Final = "as are earthquakes (metres in Chile since 2010)"
 #: National frames that are ITRF realisations at a fixed epoch. PROJ does not model the motion since this epoch.
 HELD: Final = {
     "JGD2011": HeldFrame(
-        "ITRF2008", 2011.4, "EURA", (5.0, 30.0), "as is the epoch 1997.0 of western Japan (--map-epoch 1997)"
+        "ITRF2008", 2011.4, "EURA", (5.0, 30.0), "and western Japan has the epoch 1997.0 (--map-epoch 1997)"
     ),
-    "JGD2000": HeldFrame("ITRF94", 1997.0, "EURA", (5.0, 30.0), "as is the earthquake of 2011, up to 5 m"),
-    "KGD2002": HeldFrame("ITRF2000", 2002.0, "AMUR", (0.0, 3.0), "as is the earthquake of 2011, 0.01 to 0.06 m"),
+    "JGD2000": HeldFrame("ITRF94", 1997.0, "EURA", (5.0, 30.0), "as is the earthquake of 2011 (up to 5 m)"),
+    "KGD2002": HeldFrame("ITRF2000", 2002.0, "AMUR", (0.0, 3.0), "as is the earthquake of 2011 (0.01 to 0.06 m)"),
     "China Geodetic Coordinate System 2000": HeldFrame("ITRF97", 2000.0, "EURA", (3.0, 30.0)),
     "TWD97": HeldFrame("ITRF94", 1997.0, "EURA", (0.0, 80.0), "as is the earthquake of 1999"),
     "Hong Kong Geodetic CS": HeldFrame("ITRF96", 1998.121, "EURA", (5.0, 10.0)),
     "Macao 2008": HeldFrame("ITRF2005", 2008.38, "EURA", (5.0, 10.0)),
-    "GDM2000": HeldFrame("ITRF2000", 2000.0, "EURA", (3.0, 10.0), "as is the earthquake of 2004, up to 0.2 m"),
+    "GDM2000": HeldFrame("ITRF2000", 2000.0, "EURA", (3.0, 10.0), "as is the earthquake of 2004 (up to 0.2 m)"),
     "GSK-2011": HeldFrame("ITRF2008", 2011.0, "EURA", (0.0, 5.0)),
-    "TUREF": HeldFrame("ITRF96", 2005.0, "EURA", (0.0, 25.0), "as are the earthquakes of 2023, metres"),
+    "TUREF": HeldFrame("ITRF96", 2005.0, "EURA", (0.0, 25.0), "as are the earthquakes of 2023 (metres)"),
     "IGRS": HeldFrame("ITRF2000", 1997.0, "ARAB", (0.0, 5.0)),
     "ONGD14": HeldFrame("ITRF2008", 2013.15, "ARAB"),
     "NZGD2000": HeldFrame(
@@ -102,8 +102,8 @@ HELD: Final = {
         2000.0,
         "AUST",
         (0.0, 35.0),
-        "as are the earthquakes of 2010 to 2016, metres; the deformation grid of PROJ (projsync --area-of-use 'New "
-        "Zealand') has both",
+        "as are the earthquakes of 2010 to 2016 (metres); the deformation grid of PROJ (projsync --area-of-use 'New "
+        "Zealand') includes both",
         border=("PCFC", (-44.6, 167.8), (-37.6, 178.5)),
     ),
     "PNG94": HeldFrame("ITRF92", 1994.0, "AUST", (0.0, 90.0)),
@@ -113,7 +113,7 @@ HELD: Final = {
     "Moznet": HeldFrame("ITRF94", 1996.9, "SOMA", (0.0, 4.0)),
     "RGRDC 2005": HeldFrame("ITRF2000", 2005.4, "NUBI", (0.0, 2.0)),
     "RGR92": HeldFrame("ITRF91", 1993.0, "SOMA", (0.0, 2.0)),
-    "RGM04": HeldFrame("ITRF2000", 2004.0, "SOMA", (0.0, 2.0), "as are the earthquakes of 2018, 0.2 m"),
+    "RGM04": HeldFrame("ITRF2000", 2004.0, "SOMA", (0.0, 2.0), "as are the earthquakes of 2018 (0.2 m)"),
     "ISN93": HeldFrame("ITRF93", 1993.5, "EURA", (0.0, 20.0)),
     "ISN2004": HeldFrame("ITRF2000", 2004.6, "EURA", (0.0, 20.0)),
     "ISN2016": HeldFrame("ITRF2014", 2016.5, "EURA", (0.0, 20.0)),

@@ -342,7 +342,7 @@ def plan_segment(
     """Create a segment from coordinates in easting-northing or longitude-latitude order, shape (n, 2) or (n, 3).
 
     Points that repeat the previous point in plan are left out. If all heights are 0, they count as missing. Raise
-    InputFileError if fewer than two points remain, only some heights are missing, or coordinates are not valid.
+    InputFileError if fewer than two points remain, some but not all heights are missing, or coordinates are not valid.
     """
     source = f"{path} ({name})"
     if not np.isfinite(coordinates[:, :2]).all():
