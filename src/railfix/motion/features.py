@@ -1,8 +1,8 @@
 """Positions from changes of gradient and curvature (P2 2.3): features of a map, and matching of measured features.
 
 P2 uses the positions at which gradient and curvature change, instead of their values, so that slow sensor biases have
-no effect. A position is accepted under three conditions: the wheel distance from the last accepted feature agrees with
-the map, the second quantity agrees with the map, and no other position fits nearly as well.
+no effect. A position from one quantity is accepted under three conditions: the other quantity agrees with the map, no
+other position fits nearly as well, and the wheel distance since the last feature agrees with the map.
 """
 
 from __future__ import annotations
@@ -33,8 +33,7 @@ HALF_LENGTH_M: Final = 60.0  #: Length of line before and after a feature that i
 #: Changes below this fraction of a larger change within `HALF_LENGTH_M` are ignored, because the curvature of a line
 #: through sparse points has ripples.
 _RIPPLE: Final = 0.2
-#: Length over which a change is computed. This is about the distance between the bogies of a vehicle, which smooths
-#: shorter changes.
+#: Length over which a change is computed: about the distance of a vehicle's bogies, which smooth shorter changes.
 BASE_M: Final = 15.0
 
 

@@ -11,7 +11,7 @@ During a slip, this sine exceeds the gradient of any line. There are two rules:
 During a slip, speed and distance are integrated from the accelerometer, corrected for pitch and offset. With "map", the
 integration starts before the detection (`LOOK_BACK_S`). The offset is estimated while the wheel rolls. Without a gyro,
 the pitch is the slope of the line where the position is known. With a gyro, the pitch is the integral of the pitch rate
-(P2 2.1(3)). It is slowly corrected to the slope of the line, or to the pitch from wheel and accelerometer.
+(P2 2.1(3)). It is slowly corrected to the slope of the line or, if unknown, to the pitch from wheel and accelerometer.
 """
 
 from __future__ import annotations
@@ -45,14 +45,15 @@ class MotionState(IntEnum):
 
 #: Largest difference of the pitch sines of vehicle and line without a slip, equivalent to 0.15 m/s2.
 _MAP_LIMIT: Final = 0.015
-#: The same limit in standard deviations of this difference while the wheel rolls; the larger limit is used. It is
-#: needed because a pitching body accelerates an accelerometer that is mounted high.
+#: Largest difference of the pitch sines in standard deviations while the wheel rolls; the larger limit is used. This
+#: limit is required because a pitching body accelerates an accelerometer that is mounted high.
 _NOISE_SIGMAS: Final = 5.0
-_NOISE_S: Final = 30.0  #: Time constant with which this standard deviation is estimated.
+_NOISE_S: Final = 30.0  #: Time constant with which the standard deviation of the pitch sines is estimated.
 _LATCH_MPS: Final = 0.15  #: Largest difference of wheel and inertial speeds at which a slip can end.
-_LATCH_SHARE: Final = 0.01  #: The same limit as a fraction of the speed; the larger limit is used.
+_LATCH_SHARE: Final = 0.01  #: As `_LATCH_MPS`, as a fraction of the speed; the larger limit is used.
 _LATCH_S: Final = 0.5  #: Time for which the speeds must agree before a slip ends.
-LOOK_BACK_S: Final = 0.3  #: Start of the inertial speed: this time, `confirm_s` and `SMOOTHING_S` before the detection.
+#: The inertial speed of a slip starts this time plus `confirm_s` plus `SMOOTHING_S` before the slip is detected.
+LOOK_BACK_S: Final = 0.3
 #: Longest use of an inertial speed, whose assumed drift `carry_drift_mps2` then amounts to 0.3 m/s.
 _LONGEST_CARRY_S: Final = 30.0
 #: Time constant of the low-pass filter of the pitch. It suppresses pitching of the body (about 1 Hz) and vibration.
@@ -66,8 +67,8 @@ _FASTEST_MPS: Final = 100.0  #: Largest plausible inertial speed.
 #: Time for which the body pitches after a stop. After this time, the measured pitch is the pitch at standstill.
 _SETTLING_S: Final = 2.0
 _ROLLING_LIMIT: Final = 0.002  #: Change of the pitch sine since standstill that indicates rolling away.
-_ROLLING_S: Final = 0.3  #: Time for which this change must persist.
-_ROLLING_MPS: Final = 0.05  #: Inertial speed that the train must also exceed.
+_ROLLING_S: Final = 0.3  #: Time for which a change must persist to indicate rolling away.
+_ROLLING_MPS: Final = 0.05  #: Inertial speed that a train rolling away must also exceed.
 
 
 class SlipLimits(Settings):
