@@ -49,7 +49,7 @@ class AntennaRows:
         return [(index.trajectory, rows) for index, rows in zip(self.indices, self.parts, strict=True)]
 
     def apart(self, function: Callable[..., Value], *of_antennas: Sequence[Any]) -> list[Value]:
-        """Return a function's results for each antenna: its arguments are search index, rows and item of each list."""
+        """Call a function with each antenna's search index, rows and items of the lists; return all results."""
         return [function(*each) for each in zip(self.indices, self.parts, *of_antennas, strict=True)]
 
     def each(self, function: Callable[..., Value], *of_antennas: Sequence[Any]) -> Value:
@@ -59,7 +59,7 @@ class AntennaRows:
     def each_with_state(
         self, function: Callable[..., tuple[Value, State]], *of_antennas: Sequence[Any]
     ) -> tuple[Value, list[State]]:
-        """Call a function that returns a value and a state for each antenna; join the values."""
+        """Call `function`, which returns a value and a state, for each antenna; return joined values and all states."""
         found = self.apart(function, *of_antennas)
         return join_epochs([rows for rows, _ in found]), [state for _, state in found]
 

@@ -77,9 +77,9 @@ class DopplerSpeed:
     speed_mps: Floats
     sigma_mps: Floats  #: Standard deviation of `speed_mps`, shape (T,).
     clock_drift_mps: Floats  #: c times the receiver clock drift, shape (T,).
-    residual_mps: Floats  #: Measured minus fitted range rate, shape (T, K); NaN for unused channels.
-    used: Masks  #: Dopplers used in the fit, shape (T, K).
-    rejected: Masks  #: Dopplers rejected as outliers, shape (T, K).
+    residual_mps: Floats  #: Measured minus fitted range rate of used and rejected Dopplers, shape (T, K); else NaN.
+    used: Masks  #: True for Dopplers used in the fit, shape (T, K).
+    rejected: Masks  #: True for Dopplers rejected as outliers, shape (T, K).
     n_used: Integers  #: Number of Dopplers used, shape (T,).
     scale: float  #: Ratio of the receiver's Doppler noise in the whole log to the noise assumed in the limits.
 

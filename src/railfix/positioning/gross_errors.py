@@ -29,7 +29,8 @@ GROSS_M: Final = 100.0
 AGREEING_M: Final = 30.0
 #: Minimum number of redundant ranges after an exclusion at a 3-D position, so that the result can be tested.
 _LEFT_IN_SPACE: Final = 3
-#: With fewer redundant ranges, the residuals after every other exclusion must be larger by this factor.
+#: With fewer redundant ranges than `_LEFT_IN_SPACE`, residuals after all other exclusions must be larger by this
+#: factor.
 _CLEARER: Final = 5.0
 #: Corrected codes with residuals above this multiple of the robust scale disagree with the other codes.
 _DISAGREE: Final = 5.0
@@ -171,7 +172,7 @@ class LineScan(NamedTuple):
 
     arc_m: Floats  #: Arc length of the best-fitting point, shape (T,).
     gross: Masks  #: True for ranges with a residual above `GROSS_M` at the point, shape (T, M).
-    #: Redundancy of the other ranges, shape (T,); 0 where they do not agree with the point.
+    #: Redundancy of the ranges without gross errors, shape (T,); 0 where they do not agree with the point.
     agreeing: Integers
     clear: Masks  #: True where all points with other gross errors have a clearly larger cost, shape (T,).
 

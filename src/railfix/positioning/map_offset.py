@@ -38,7 +38,7 @@ class MapOffsetLimits(Settings):
     least_samples: float = Field(default=3.0, gt=0)  #: Minimum number of independent samples for a decision.
     #: Probability that noise alone causes a note on the map (chi-square, two degrees of freedom).
     note_risk: float = Field(default=1e-2, gt=0, lt=1)
-    #: Probability that noise alone causes the status for a wrong map, if the nominal sigmas are correct. On recordings
+    #: Probability that noise alone causes the status `map_offset`, if the nominal sigmas are correct. On recordings
     #: with a correct map and all screens, the statistic is below the default threshold of 13.8
     #: (``tests/references/results/bounds.txt``).
     risk: float = Field(default=1e-3, gt=0, lt=1)
@@ -52,12 +52,12 @@ class MapOffsetLimits(Settings):
 
     @cached_property
     def threshold(self) -> float:
-        """Threshold of the statistic for the status of an epoch."""
+        """Threshold of the statistic for the status `map_offset`."""
         return float(scipy.special.chdtri(2, self.risk))
 
     @cached_property
     def detectable_sigmas(self) -> float:
-        """Smallest detectable offset in sigmas: the status test misses it with the probability `missed`."""
+        """Smallest detectable offset in sigmas; the test for `map_offset` misses it with the probability `missed`."""
         return float(np.sqrt(scipy.special.chndtrinc(self.threshold, 2, self.missed)))
 
 
@@ -238,5 +238,5 @@ def _inverse_2x2(matrix: Floats) -> Floats:
 
 
 def beyond_threshold(offset: MapOffset, limits: MapOffsetLimits) -> Masks:
-    """Return True for epochs whose statistic exceeds the threshold for the status, shape (T,)."""
+    """Return True for epochs whose statistic exceeds the threshold for the status `map_offset`, shape (T,)."""
     return np.asarray(offset.statistic > limits.threshold)

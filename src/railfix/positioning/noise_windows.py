@@ -15,7 +15,7 @@ Dated = tuple[np.datetime64, float]
 
 
 class Windows(NamedTuple):
-    """Ages of T epochs, counted in windows from the start of the log; the rows are those of A antennas in turn."""
+    """Ages of T epochs of A antennas, in windows since the start of the log."""
 
     step_s: Floats  #: Time since the previous epoch, shape (T,); 0 at the first epoch.
     growth: Floats  #: Exponential of the age since the start of the epoch's span (`kernels.windows.SPAN`), shape (T,).

@@ -27,8 +27,8 @@ from railfix.positioning.normal_equations import SinglePoint, misfit, normal_equ
 from railfix.positioning.range_arrays import Ranges
 from railfix.positioning.search_index import SearchIndex
 
-#: Probability that noise exceeds the excess of q up to which alternative positions are searched for. This excess is
-#: larger than the ambiguity threshold, because a range fault can increase q at the true position.
+#: Probability that noise alone causes an excess of q above the search limit for alternative positions. The search limit
+#: is larger than the ambiguity threshold, because a range fault can increase q at the true position.
 _REACH_RISK: Final = 1e-16
 
 

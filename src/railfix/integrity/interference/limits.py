@@ -73,12 +73,12 @@ CAUSES: Final = tuple(cause for cause in Sign if cause)  #: All signs but NONE, 
 class InterferenceLimits(Settings):
     """Limits of the interference tests.
 
-    With the defaults, the test recordings have no sign; see ``tests/references/results/interference.txt``.
+    With the defaults, no sign occurs on the test recordings (``tests/references/results/interference.txt``).
     """
 
     use: Literal["on", "off"] = "on"
     least_satellites: int = Field(default=6, ge=5)  #: Minimum number of satellites in a comparison of satellites.
-    #: Minimum fall of C/N0 below its recent peak that counts as a sign; median over all satellites.
+    #: Minimum fall of C/N0 below its recent peak (median over all satellites) that counts as a sign.
     fall_db: float = Field(default=5.0, gt=0)
     #: Largest standard deviation, over the satellites, of the C/N0 falls caused by jamming. A jammer raises the noise
     #: of all channels equally; walls and roofs do not.
@@ -118,12 +118,12 @@ class InterferenceLimits(Settings):
     largest_sigma_m: float = Field(default=30.0, gt=0)  #: Largest standard deviation of a compared position.
     #: Time for which a fall of C/N0 or gain, equal C/N0, or a position off the map must persist to be a sign.
     hold_s: float = Field(default=3.0, gt=0)
-    part_hold_s: float = Field(default=10.0, gt=0)  #: Time for which constellations must differ.
+    part_hold_s: float = Field(default=10.0, gt=0)  #: Time for which two constellations must differ.
     #: Length of the window over which GNSS and wheel distances are compared.
     wheel_window_s: float = Field(default=120.0, gt=0)
     wheel_least_s: float = Field(default=60.0, gt=0)  #: Minimum length of a window that begins at a slip or a data gap.
-    wheel_m: float = Field(default=20.0, gt=0)  #: Minimum difference between GNSS and wheel distance.
-    wheel_sigmas: float = Field(default=6.0, gt=0)  #: Minimum difference in standard deviations.
+    wheel_m: float = Field(default=20.0, gt=0)  #: Minimum difference of GNSS and wheel distance that is a sign.
+    wheel_sigmas: float = Field(default=6.0, gt=0)  #: Minimum of this difference in standard deviations.
     #: Whether the filter's protection level covers spoofing that slowly shifts the position along the track and that
     #: the comparison with the wheel has not detected yet. With "on", the protection level is two to four times as
     #: large.

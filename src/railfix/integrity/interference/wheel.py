@@ -64,7 +64,7 @@ class WheelSigns:
     #: GNSS distance minus scaled wheel distance over the window, shape (T,); NaN where not compared.
     difference_m: Floats
     #: Bound of the position error caused by spoofing that began within the window, shape (T,): absolute difference plus
-    #: `wheel_level_sigmas` standard deviations of the position at the window start and of the wheel distance.
+    #: `wheel_level_sigmas` times the combined standard deviation of wheel distance and position at the window start.
     bound_m: Floats
     #: True where the difference exceeds its limits, or exceeded them within the release time; shape (T,).
     parted: Masks
@@ -84,7 +84,7 @@ def wheel_signs(
 
     `arc_m` are single-epoch or filtered positions along the line, `sigma_m` their standard deviations, and `wheel_m`
     the wheel distances since the previous epoch. All have the shape (T,), with NaN where unknown. `signed` is True if
-    the sign of the wheel distance is the direction of motion along the line.
+    the sign of the wheel distance indicates the direction of motion along the line.
     """
     if not len(time):
         return WheelSigns(difference_m=np.empty(0), bound_m=np.empty(0), parted=np.empty(0, dtype=np.bool_)), state

@@ -32,7 +32,7 @@ from railfix.integrity.protection.risk import one_sided_k, set_sums
 #: Number of bisections for a level. They reduce an interval of 1e4 m to less than 0.1 micrometres.
 _HALVINGS: Final = 48
 _LONGEST_M: Final = 1e4
-_BLOCK_SIZE: Final = 4_000_000  #: Largest number of elements of an array of a block of epochs.
+_BLOCK_SIZE: Final = 4_000_000  #: Largest number of array elements in a block of epochs.
 #: A matrix is singular if its determinant is below this fraction of the product of its diagonal.
 _SINGULAR: Final = 1e-12
 
@@ -140,7 +140,6 @@ def _block(
     probability = np.where(size[None, :] <= order[:, None], probability, 0.0)
     out = np.concatenate([np.zeros((1, masks.shape[1]), dtype=bool), masks])
     kept = used[:, None, :] & ~out
-    # observations kept in each mode have weight 1/sigma^2, removed and unused observations 0
     weight = np.where(kept, 1.0 / np.where(used, geometry.sigma_int_m[rows], 1.0)[:, None] ** 2, 0.0)
     gain, sigma = _gains(design, weight, components)
     acc = np.where(used, geometry.sigma_acc_m[rows], 0.0)[:, None, None]

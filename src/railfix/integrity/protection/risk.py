@@ -74,7 +74,7 @@ class RiskBudget(Settings):
     #: Fraction of the risk for faults that are not hypotheses. If these faults are more probable, more faults become
     #: hypotheses, with up to four satellites and three shared faults (constellation, side, map) at the same time.
     unchecked_share: float = Field(default=0.3, gt=0, lt=1)
-    #: Fraction of the risk for epochs with one excluded satellite; the same fraction is allocated to two.
+    #: Fraction of the risk for epochs with one excluded satellite, and equally for epochs with two.
     exclusion_share: float = Field(default=0.1, ge=0, lt=0.5)
     #: Probability per epoch that noise alone makes the solution separations exceed their thresholds; 1e-3 in P4.
     false_alarm: float = Field(default=1e-3, gt=0, lt=1)
@@ -222,7 +222,7 @@ def allocate(
 ) -> Allocation:
     """Choose the fault hypotheses of each epoch and divide the risk among them.
 
-    Always hypotheses: a single satellite, a side, and a constellation or the map, each alone and with one satellite.
+    A single satellite, a side, and a constellation or the map (alone and with one satellite) are always hypotheses.
     Pairs of satellites are hypotheses where they are more probable than the risk allocated to two faults. The most
     probable other classes are added until the remaining classes are within the risk for unchecked faults. `out`, shape
     (T,), is the number of excluded satellites. `sides`, shape (T, S, M), are the sets of satellites that may be faulty

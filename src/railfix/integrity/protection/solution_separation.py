@@ -90,7 +90,7 @@ class ProtectionLevel(NotebookTable):
     consistent: Masks
     #: Channel whose fault determines `one_fault_m`, shape (T,); -1 if another fault does.
     worst_one: Indices
-    worst_two: Indices  #: Channels whose faults determine `two_fault_m`, shape (T, 2); -1 if others do.
+    worst_two: Indices  #: Channels whose faults determine `two_fault_m`, shape (T, 2); -1 if other faults do.
     #: Constellation whose fault determines `one_fault_m`, shape (T,); empty if another fault does.
     worst_constellation: Strings
     unchecked_risk: Floats  #: Probability of faults that are not hypotheses, subtracted from the risk, shape (T,).

@@ -55,7 +55,7 @@ class LinearModel:
     #: Position covariance Q with the prior, shape (T, 3, 3); NaN where the position is undetermined.
     covariance_m2: Floats
     prior: Floats  #: Prior information P on the position, from the map sigmas, shape (3, 3) [1/m^2].
-    #: Whitened code minus distance y, clocks not subtracted, shape (T, M); 0 for unused ranges.
+    #: Whitened code minus distance (y), which contains the clock, shape (T, M); 0 for unused ranges.
     misfit: Floats
     freedom: Integers  #: Degrees of freedom: ranges minus unknowns, shape (T,); may be negative.
     interest: int  #: Number of components of interest: 1 on the line, 2 in space (horizontal).

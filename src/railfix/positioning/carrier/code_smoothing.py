@@ -46,11 +46,11 @@ class SlipReason(IntFlag):
     GAP = 1 << 4  #: The interval since the previous epoch exceeds `max_gap_s`.
     BREAK = 1 << 5  #: The log marks a break before this epoch.
     DOPPLER = 1 << 6  #: The phase change disagrees with the Dopplers.
-    CODE = 1 << 7  #: The phase change disagrees with the code change. Tested without precise Dopplers.
+    CODE = 1 << 7  #: The phase change disagrees with the code change (tested only without precise Dopplers).
 
 
 class CycleSlipLimits(Settings):
-    """Limits of the slip tests for an interval dt.
+    """Limits of the slip tests, for an interval dt [s].
 
     The Doppler test rejects a change above ``doppler_m + doppler_mps dt + jerk_mps3 dt^3 / 12``. The three terms are
     phase noise, mean Doppler noise, and the error of the trapezoidal rule for a motion with this jerk. A slip of one
@@ -60,8 +60,8 @@ class CycleSlipLimits(Settings):
 
     #: Longest interval across which an arc continues. Station logs have intervals of 30 s.
     max_gap_s: float = Field(default=31.0, gt=0)
-    #: Constant part of the limit of phase change minus predicted change from Dopplers. For recorded data at 1 Hz, the
-    #: median of this difference is 0.01 to 0.04 m.
+    #: Constant part of the Doppler test limit. For recorded data at 1 Hz, the median of phase change minus change
+    #: predicted from Dopplers is 0.01 to 0.04 m.
     doppler_m: float = Field(default=0.05, gt=0)
     #: Part of the Doppler test limit that is proportional to the interval.
     doppler_mps: float = Field(default=0.05, gt=0)
@@ -106,7 +106,7 @@ def median_or_zero(values: Floats) -> Floats:
 
 
 def _before(values: Floats, last: Floats) -> Floats:
-    """Return the values of the previous epoch for each epoch; `last` has those before the first epoch."""
+    """Return the values of the previous epoch for each epoch; `last` precedes the first epoch."""
     return np.concatenate([last[None], values[:-1]])
 
 
