@@ -33,7 +33,7 @@ def observations_to_xarray(observations: Observations) -> xr.Dataset:
     xarray.Dataset
         One variable over ``time`` and ``sv`` for each observation type, NaN where absent. The variables
         ``break_before`` over ``time`` and ``glonass_channel`` over ``sv`` are additions to the layout of georinex. The
-        attributes hold the header.
+        attributes contain the header.
     """
     import xarray as xr
 
@@ -90,8 +90,8 @@ def observations_from_xarray(data: xr.Dataset) -> Observations:
     Raises
     ------
     ValueError
-        The dataset has no observation types over ``time`` and ``sv``, an unknown time system, or times
-        that do not rise.
+        The dataset has no observation types over ``time`` and ``sv``, its time system is unknown, or its times do not
+        rise.
     """
     import xarray as xr
 

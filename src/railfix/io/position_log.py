@@ -125,7 +125,7 @@ def positions_of_table(table: NamedColumns) -> PositionLog:
             raise table.header_error(f"column {absent[name]!r} is unknown; is {name!r} meant?")
     if not geodetic and not cartesian:
         raise table.header_error(
-            "no columns latitude_deg, longitude_deg, height_m (ellipsoidal) nor x_m, y_m, z_m (ECEF); the columns are "
+            "no columns latitude_deg, longitude_deg, height_m (ellipsoidal) or x_m, y_m, z_m (ECEF); the columns are "
             f"{', '.join(table.cells)} (for other column names, give columns, --column latitude_deg=NAME)"
         )
     if not len(table):

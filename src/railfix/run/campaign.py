@@ -180,7 +180,7 @@ def position_runs(
     progress: CampaignProgress | None = None,
     lost: tuple[type[Exception], ...] = (BrokenExecutor,),
 ) -> pl.DataFrame:
-    """Position runs whose results folders are below ``out / "runs"``. Other parameters and result: see `run_campaign`.
+    """Position runs whose results folders are below ``out / "runs"``. Parameters and result are as in `run_campaign`.
 
     Raise OutputError if `out` is not empty and not the folder of a campaign.
     """

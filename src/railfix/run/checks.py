@@ -25,7 +25,7 @@ _SECOND: Final = np.timedelta64(1, "s")
 #: Number of conventional positions per antenna after which a run stops if all of them are farther from the line than
 #: `ANOTHER_PLACE_M`.
 ENOUGH_TO_STOP: Final = 10
-#: Largest time between a log and its navigation records. Records at a larger distance are assumed to be of another day.
+#: Largest time between a log and its navigation records. More distant records are assumed to be of another day.
 ANOTHER_DAY: Final = np.timedelta64(24, "h")
 #: Sensors with samples only at events. They may have no samples for a long time, if the train is at rest or passes no
 #: balise or ground unit.
@@ -96,8 +96,8 @@ def check_same_day(navigation: Navigation, tally: Tally, *, reach: np.timedelta6
 def check_same_place(tally: Tally, *, antennas: Literal["all", "any"] = "any") -> None:
     """Raise MismatchError if all conventional positions are farther than `ANOTHER_PLACE_M` from the line.
 
-    During a run, `antennas` is "all": the error requires that every antenna has at least `ENOUGH_TO_STOP` positions,
-    all far from the line. At the end, `antennas` is "any": one antenna with positions, all far from the line, suffices.
+    With "all" (during a run), the error is raised if every antenna has at least `ENOUGH_TO_STOP` positions, all far
+    from the line. With "any" (after a run), one antenna with positions that are all far from the line suffices.
     """
     enough = ENOUGH_TO_STOP if antennas == "all" else 1
     elsewhere = [
@@ -155,7 +155,7 @@ def check_sensor_time(sensors: SensorSamples, tally: Tally) -> tuple[str, ...]:
 
 
 def check_base(base: BaseLog, tally: Tally, trajectories: Mapping[str, Trajectory]) -> None:
-    """Raise MismatchError if a base station is too far from the line, or its log and all other logs do not overlap."""
+    """Raise MismatchError if a base station is too far from the line, or if its log overlaps no antenna's log."""
     distance = min(np.linalg.norm(own.ecef_m - base.ecef_m, axis=1).min() for own in trajectories.values()) / 1e3
     if distance > LONGEST_KM:
         raise MismatchError(

@@ -51,7 +51,7 @@ class FileFinding:
     kind: Kind
     facts: tuple[str, ...]  #: Short descriptions of the content, shown to the user.
     span: Span | None = None  #: First and last time of the content, GPS time; None if unknown.
-    place_ecef_m: Floats | None = None  #: Approximate position of the content, ECEF, shape (3,) [m], or None.
+    place_ecef_m: Floats | None = None  #: A position in or near the content, ECEF, shape (3,) [m]; None if unknown.
     #: First and last reference time of the ephemerides in the file, or None if the file has no ephemerides.
     ephemerides: Span | None = None
     options: tuple[str, ...] = ()  #: Command-line options that are needed to read the file.

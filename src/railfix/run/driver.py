@@ -197,7 +197,7 @@ def open_inputs(
 
 
 def find_record_time(navigation: Navigation) -> np.datetime64 | None:
-    """Return the median time of the navigation data, used as epoch of reference frames, or None without data."""
+    """Return the median time of the navigation data, the epoch of frame transformations, or None without data."""
     clocks = np.concatenate([navigation.kepler.toc, navigation.glonass.toe])
     if navigation.precise is not None:
         clocks = navigation.precise.time
@@ -282,7 +282,7 @@ def _single_epochs(screened: Iterator[Chunk], processor: EpochProcessor) -> Iter
 def _causes(
     tally: Tally, logs: Mapping[Antenna, Log], processor: EpochProcessor, config: Config, line: OpenedLine
 ) -> dict[str, str]:
-    """Return the likely cause, or "", for each antenna with 90 % of its positions off or contradicting the map."""
+    """Return the likely cause ("" if unknown) by antenna, if 90 % of its positions are off or contradict the map."""
     causes: dict[str, str] = {}
     for name in logs:
         antenna = tally.antennas[name]
@@ -428,7 +428,7 @@ def _notes_of_levels(config: Config, tally: Tally) -> Iterator[str]:
         return
     used = sum(antenna.used for antenna in tally.antennas.values())
     excluded = sum(antenna.first_reason["fault_excluded"] for antenna in tally.antennas.values())
-    # If the fault rate implied by exclusions beyond the false alarms significantly exceeds the prior, note this.
+    # Exclusions beyond the expected false alarms are taken as faults. Their rate is compared with the prior.
     observed = sum(antenna.observed for antenna in tally.antennas.values())
     faults = excluded - config.raim.false_alarm * observed
     prior = risk.local_prior + max(risk.satellite_prior.values())

@@ -184,7 +184,7 @@ class RunInputs(InputFiles):
         return self
 
     def prepare(self, config: Config) -> tuple[Self, Config]:
-        """Check the inputs. Return them with the files that settings name, and settings without ``sbas = "stream"``."""
+        """Check the inputs. Return them, including files that settings name, and settings without ``sbas="stream"``."""
         self.check()
         config = self._with_own_sbas(config)
         inputs = self.with_settings(config)
@@ -241,7 +241,7 @@ def check_given_once(files: Iterable[tuple[str, Path]]) -> None:
 
 
 def record_path(path: Path, folder: Path) -> str:
-    """Return the path of an input for the record. A relative path is converted to be relative to the results folder."""
+    """Return the path of an input for the record. Relative paths are recorded relative to the results folder."""
     if path.is_absolute():
         return str(path)
     return Path(os.path.relpath(path.resolve(), folder.resolve())).as_posix()

@@ -128,7 +128,7 @@ _CHUNK_EPOCHS: Final = 3000
 _EPOCHS: Final = 5
 #: Largest horizontal distance from the line of a position that is taken to be on the line [m].
 _ON_LINE_M: Final = 150.0
-#: Height difference between positions and line above which range errors are assumed not to be the cause [m].
+#: A larger height difference between positions and line is assumed not to be due to range errors [m].
 _HEIGHT_M: Final = 30.0
 #: GPS time minus UTC since 2017 [s].
 _LEAP_S: Final = 18

@@ -1,4 +1,4 @@
-"""Writing of output files under temporary names, which are moved to the output folder when all files are complete.
+"""Writing of output files under temporary names. All files are moved to the output folder when they are complete.
 
 An output never replaces an input. The files are first written to a hidden, locked staging folder. If a process is
 killed, its staging folder remains, but the operating system releases the lock. A staging folder that is not locked
@@ -402,8 +402,8 @@ def check_not_input(target: Path, inputs: Sequence[Path]) -> None:
 def check_output_file(target: Path, *, overwrite: Overwrite, inputs: Sequence[Path], kind: FileKind = "any") -> None:
     """Raise OutputError if an output file cannot or must not be written.
 
-    The error is raised if the folder of the file does not exist or is not writable, if the path is a folder or one of
-    `inputs`, if the file exists (with "refuse"), or if its name has no ending of its kind.
+    This is the case if the folder of the file does not exist or is not writable, if the path is a folder or one of
+    `inputs`, if the file exists (with "refuse"), or if the name ending does not match `kind`.
     """
     with _writing(target):
         check_not_input(target, inputs)

@@ -31,7 +31,7 @@ from railfix.track.trajectory import Trajectory
 
 
 def with_measured_priors(config: Config) -> Config:
-    """Return settings with the fault priors, and the line sections without a protection level, of their error model.
+    """Return settings, completed by their error model: fault priors, and line sections without a protection level.
 
     The settings remain unchanged if they have no error model, if they specify a fault prior, or if the error model has
     no bounds of fault priors. Sections without a protection level that the settings specify are kept.
@@ -47,7 +47,7 @@ def with_measured_priors(config: Config) -> Config:
 
 
 def sbas_corrections(config: Config) -> SbasState | None:
-    """Return the SBAS corrections of recorded messages or the state before the first message, or None without SBAS.
+    """Return the SBAS corrections, or None if the settings do not use SBAS.
 
     The settings name the files with the recorded messages. With ``sbas = "stream"``, messages arrive during the run,
     and the state before the first message is returned. With ``sbas_prn = "best"``, the GEO is selected from the
@@ -105,7 +105,7 @@ def make_processor(
     )
 
 
-#: Base-station time tags up to this much later than the train's are assumed to be of the same instant.
+#: A base-station time tag that is later than the train's by at most this is assumed to be of the same instant.
 _SAME_INSTANT = np.timedelta64(50, "ms")
 
 

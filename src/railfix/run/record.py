@@ -44,7 +44,7 @@ def compute_figures(folder: OutputFolder, tally: Tally, config: Config) -> dict[
     """Return statistics of each antenna, computed from the written tables. Lengths are in metres.
 
     There are statistics of the sigma along the line, the chainage, the finite protection levels (with epochs by
-    status), and the filter (with epochs by status, and levels within each limit of `WITHIN_M`); None if missing.
+    status), and the filter (with epochs by status, and levels within each limit of `WITHIN_M`). Missing ones are None.
     """
     return {
         name: {
@@ -174,7 +174,7 @@ def package_versions() -> dict[str, str]:
     return versions
 
 
-#: Settings, by group and name, in records of earlier versions, which never affected a result.
+#: Settings that never affected a result, by group and name; records of earlier versions have them.
 WITHOUT_EFFECT: Final = (("section", "predicted_sigmas"),)
 
 
@@ -355,7 +355,7 @@ def _epochs_table(antennas: Mapping[str, Facts], basis: str, caption: str) -> Ta
 
 
 def _rows_of_few(antennas: Sequence[Facts]) -> Iterator[list[str]]:
-    """Yield, for each rejection reason, the numbers of epochs with too few satellites due to it, and to it alone."""
+    """Yield a row per rejection reason: epochs with too few satellites because of the reason, and of it alone."""
     first = [Counter(facts.get("too_few_satellites_by_first_reason") or {}) for facts in antennas]
     alone = [Counter(facts.get("too_few_satellites_by_one_reason_alone") or {}) for facts in antennas]
     for reason in dict.fromkeys(name for counts in first for name, _ in counts.most_common()):

@@ -35,7 +35,7 @@ from railfix.track.network_route import find_route, left_out_note
 
 #: Interval of the matched positions [s].
 _INTERVAL_S: Final = 1.0
-#: Largest distance along the route from a position to a track of the route that is near the position [m].
+#: A track of the route is near a position if it is within this distance along the route [m].
 _REACH_M: Final = 50.0
 #: Assumed bound on the relative difference between lengths in plan and lengths along the line. `_REACH_M` is increased
 #: by this fraction of the route length.
@@ -132,10 +132,10 @@ class RouteOfLog:
         """Return whether the probability that the train is not on the route exceeds `risk` at each time, shape (T,).
 
         The probability of the route is the sum over its tracks within `_REACH_M` of the chainage. More distant tracks
-        of the route may be parallel to this point, and then are wrong tracks. The probability is computed at the
-        matched positions before and after the time. The smaller value is used, because the train may change tracks
-        between these positions. Up to `_UNMAPPED_LIMIT`, the probability of an unmapped track is no reason for
-        uncertainty, because protection levels include it (`with_unmapped`).
+        of the route may be parallel to the train's track; they are wrong tracks at this chainage. The probability is
+        computed at the matched positions before and after the time. The smaller value is used, because the train may
+        change tracks between these positions. Up to `_UNMAPPED_LIMIT`, the probability of an unmapped track is no
+        reason for uncertainty, because protection levels include it (`with_unmapped`).
         """
         after = np.searchsorted(self.log.time, time)
         last = len(self.log.time) - 1

@@ -86,7 +86,7 @@ def sign_notes(
 ) -> Iterator[str]:
     """Yield a sentence on each wrong sign, unit or axis of a sensor, and on time tags that are wrong by seconds.
 
-    `places` has ``time_gpst`` and ``chainage_m`` of the single-epoch positions of one antenna that passed every check.
+    `places` has ``time_gpst`` and ``chainage_m`` of one antenna's single-epoch positions that passed every check.
     """
     wheel, radar, inertial = samples.tachometer, samples.radar, samples.inertial
     yield from _forces_at_rest(inertial)
@@ -229,7 +229,7 @@ _MOVED_M: Final = 1.0
 _FAR_M: Final = 500.0
 #: Minimum cosine of the angle between the track and the direction to the ground unit.
 _AHEAD: Final = 0.7
-#: Minimum number of ranges to ground units ahead (or behind) that are compared.
+#: Ranges to ground units ahead, or behind, are compared if there are at least this number.
 _LEAST_RANGES: Final = 10
 #: Smallest reported difference between measured ranges and ranges computed from satellite positions [m]. It is twice
 #: the assumed code error that lasts for minutes.

@@ -267,9 +267,9 @@ SAME_INSTANT_NS: Final = 20_000_000
 def align_logs(logs: Mapping[str, Iterator[Observations]]) -> Iterator[dict[str, Observations]]:
     """Yield chunks of observations that cover the same time span for every antenna.
 
-    Each antenna has its own epochs, and may have none in a span. One part of each log is read at a time; the chunk ends
-    where the first of these parts ends, and later epochs of other parts are in the next chunk. Epochs of the same
-    instant whose time tags differ slightly (`SAME_INSTANT_NS`) are in the same chunk.
+    Each antenna has its own epochs, and may have none in a span. One part of each log is read at a time. A chunk ends
+    at the earliest end of these parts; later epochs of other parts are in the next chunk. Epochs of the same instant
+    whose time tags differ slightly (`SAME_INSTANT_NS`) are in the same chunk.
     """
     live = dict(logs)
     waiting: dict[str, Observations] = {}

@@ -108,8 +108,8 @@ class AntennaTally:
     conventional_nearest_m: float = float("nan")
     #: Number of epochs by status of the protection level; empty if protection levels are off.
     level_status: Counter[str] = field(default_factory=Counter)
-    #: Number of epochs without a protection level because simultaneous faults of more satellites than can be excluded
-    #: are more probable than the risk allows, or because too many satellites are excluded.
+    #: Number of epochs without a protection level, because too many satellites are excluded, or because the probability
+    #: of more simultaneous faults than can be excluded exceeds the risk.
     without_budget: int = 0
     #: Map offset with the largest test statistic; None if no window had enough positions.
     map_offset: MapOffsetFound | None = None
@@ -273,7 +273,7 @@ class AntennaTally:
 class Tally:
     """Counts of all antennas of a run."""
 
-    min_satellites: int = 3  #: Minimum number of satellites per epoch.
+    min_satellites: int = 3  #: Minimum number of satellites of a position.
     antennas: dict[str, AntennaTally] = field(default_factory=dict)
     #: Notes of all chunks, as keys, in order of time.
     notes: dict[str, None] = field(default_factory=dict)

@@ -125,7 +125,7 @@ def judge_run(record: Mapping[str, Any]) -> Verdict:
 
 
 def _figures(facts: Mapping[str, Any], promised: Sequence[str]) -> PositionFigures:
-    """Return the figures of an antenna or its filter. `promised` are the statuses that mean a passed check."""
+    """Return the figures of an antenna or its filter. `promised` are the statuses of passed positions."""
     statuses = Counter({word: epochs for word, epochs in facts["status"].items() if epochs})
     chainage, sigma, level = (facts.get(name) or {} for name in ("chainage_m", "along_sigma_m", "level"))
     return PositionFigures(

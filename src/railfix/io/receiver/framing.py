@@ -64,7 +64,7 @@ class Frames:
 
     @cached_property
     def _by_protocol(self) -> dict[str, Indices]:
-        """Return the indices of the frames of each protocol, computed once because live epochs look up many kinds."""
+        """Return the indices of the frames of each protocol. They are cached, because a decoder looks up many kinds."""
         return {name: np.flatnonzero(self.protocol == name) for name in set(self.protocol.tolist())}
 
 
@@ -145,7 +145,7 @@ def _outside(places: Indices, start: Indices, end: Integers) -> int:
 
 
 def _at(data: Bytes, index: Indices) -> Integers:
-    """Return the bytes at offsets, 0 beyond the end of the buffer."""
+    """Return the bytes at the offsets `index`; bytes beyond the end of the buffer are 0."""
     return np.where(index < len(data), data[np.minimum(index, len(data) - 1)], 0).astype(np.int64)
 
 

@@ -208,7 +208,7 @@ class LogPiece:
 
 @dataclass(frozen=True, kw_only=True)
 class StreamState:
-    """State of the decoder of a stream after a block."""
+    """Decoder state after a block of a stream."""
 
     rest: bytes = b""  #: Bytes that are not yet processed: an incomplete frame or epoch.
     subframes: Unfinished = field(default_factory=Unfinished)

@@ -61,7 +61,7 @@ class Tracking:
 
 
 def join_observations(measurements: Measurements, tracking: Tracking | None = None) -> tuple[Observations, Tracking]:
-    """Return measurements as observations with sorted channels, and the tracking state after them.
+    """Return the measurements as observations with sorted channels, and the new tracking state.
 
     Epochs that are not later than all preceding epochs are skipped and counted.
     """
@@ -234,7 +234,7 @@ def cnav_record(satellite: str, values: Values) -> Record:
 def bcnav_record(satellite: str, message: str, values: Values) -> Record | None:
     """Return the BeiDou record from the fields of B-CNAV1 or B-CNAV2, which have the full week.
 
-    Return None if the fields are of another satellite or an unknown kind of orbit.
+    Return None if the fields are of another satellite, or if the orbit type is unknown.
     """
     if int(values["kind"]) not in nav_messages.BCNAV_AXIS_M or f"C{int(values['number']):02d}" != satellite:
         return None

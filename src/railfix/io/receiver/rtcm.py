@@ -376,7 +376,7 @@ _FIRST_MSM_WEEK: Final = 1642
 
 
 def ephemeris_date(frames: Frames, near: np.datetime64 | None) -> np.datetime64:
-    """Return the median time of a log's ephemerides, which resolves the week of observations; NaT without ephemerides.
+    """Return the median time of a log's ephemerides, from which the week of its observations is resolved, or NaT.
 
     Only Galileo ephemerides are used if there are any, else BeiDou, whose weeks are also unambiguous, else GPS and
     QZSS. GPS and QZSS send the week modulo 1024. It is resolved to the week nearest to `near`, or without `near`, to a

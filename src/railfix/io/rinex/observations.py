@@ -184,7 +184,7 @@ class BlockReader:
 #: Default number of epochs of a piece.
 DEFAULT_EPOCHS: Final = 3600
 _PEEK_BYTES: Final = 1 << 16
-#: Length of a piece divided by the length of the first piece.
+#: Ratio of the length of a piece to the length of the first piece.
 _FIRST_PART: Final = 5
 _GAP_INTERVALS: Final = 1.5  #: A longer time between two files is a gap [observation intervals].
 
@@ -242,7 +242,7 @@ def _runs(
                 last.path, "has no usable epoch; read it with broken_lines='stop' (no --lenient) to see the first fault"
             )
         begin, end = first_time(paths[0]), np.datetime64(max(reader.last_ns for reader in readers), "ns")
-        what = f"is of {str(begin)[:19]} to {str(end)[:19]}"
+        what = f"is from {str(begin)[:19]} to {str(end)[:19]}"
         if begin > end or last.last_ns >= selection.end_ns:
             what = f"begins at {str(begin)[:19]}"
         raise MismatchError(

@@ -110,7 +110,7 @@ def epoch_width(version: float) -> int:
 def read_epoch_lines(lines: Lines, which: Integers, *, version: float) -> EpochHeads:
     """Parse epoch lines of RINEX 2 (years of two digits), 3 and 4. An event may have no time."""
     width = epoch_width(version)
-    text = np.ascontiguousarray(lines.columns(which, width).T)  # a row for each column of the file
+    text = np.ascontiguousarray(lines.columns(which, width).T)  # one row per column of the file
     at = width - 35
     flag, flag_ok = _number(text[31 + at : 32 + at])
     count, count_ok = _number(_right_aligned(text[32 + at : 35 + at]))
