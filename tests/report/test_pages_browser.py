@@ -132,7 +132,7 @@ WATCH = """() => { window.times = []; window.said = []; const watch = async even
     addEventListener("mouseup", watch, true); addEventListener("keydown", watch, true); }"""
 #: Pixel of a point of the filter, by its fraction of the points of the chart.
 POINT = """(div, share) => { const p = div.parentNode.plot, r = div.getBoundingClientRect(), a = div._fullLayout,
-    l = p.chart.layers.find(l => l.label === "filtered along the track"), i = Math.floor(share * l.x.length),
+    l = p.chart.layers.find(l => l.label === "filter along the track"), i = Math.floor(share * l.x.length),
     t = p.traces()[p.layers.indexOf(l)];
     return [r.left + a.margin.l + a.xaxis.c2p(t.x[i]), r.top + a.margin.t + a.yaxis.c2p(t.y[i])]; }"""
 

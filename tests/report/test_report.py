@@ -107,8 +107,8 @@ def test_errors_in_the_page_are_those_of_the_positions(page: Page, folder: Path)
         all_rows = rows.filter(antenna=antenna).sort("time_gpst")
         ok = pl.col("status") == "ok"
         for label, column, kept in (
-            ("on the map", "chainage_m", ok),
-            ("on the map, failed a check", "chainage_m", ~ok),
+            ("single epochs", "chainage_m", ok),
+            ("single epochs, failed a check", "chainage_m", ~ok),
             ("conventional", "conventional_chainage_m", pl.lit(value=True)),
         ):
             mine = all_rows.filter(kept)
@@ -381,7 +381,7 @@ def test_the_filter_along_the_track_stands_beside_the_positions(folder: Path, tm
     runs, evaluation = read_runs([mine], [demo_truth()])
     document = report_page(runs, evaluation)
     values = chart(Page(document), "error-chainage")
-    on_map, filtered = (unpacked(layer_of(values, name)["y"]) for name in ("on the map", "filtered along the track"))
+    on_map, filtered = (unpacked(layer_of(values, name)["y"]) for name in ("single epochs", "filter along the track"))
     np.testing.assert_allclose(filtered, on_map, atol=1e-6)
     assert evaluation is not None
     largest = evaluation.figure("max_m", run="run (train)", antenna="front")

@@ -95,7 +95,7 @@ def test_a_click_shows_the_satellites_beside_the_chart_and_keys_go_on(page: Path
         chart = shown.locator("figure[data-name=error-chainage]").first
         where = shown.evaluate(
             """() => { const p = document.querySelector("figure[data-name=error-chainage]").plot;
-            const l = p.chart.layers.filter(l => l.label === "filtered along the track")[0], i = 40;
+            const l = p.chart.layers.filter(l => l.label === "filter along the track")[0], i = 40;
             return [l.x[i], p.chart.y_scale === "symlog" ? NaN : l.y[i], p.chart.epoch0 + l.epoch[i]]; }"""
         )
         shown.mouse.click(*centre_of(shown, "error-chainage", where[0], where[1]))

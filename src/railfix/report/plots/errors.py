@@ -52,14 +52,14 @@ _SIGN: Final = "Positive errors are toward the end of the line."
 _PIECES: Final = 600
 _SERIES: Final = (
     ("conventional", "conventional_error_m", CONVENTIONAL, "square"),
-    ("on the map", "error_m", CONSTRAINED, "dot"),
+    ("single epochs", "error_m", CONSTRAINED, "dot"),
 )
 
 
 def error_over_time(errors: pl.DataFrame, *, filtered: pl.DataFrame | None = None) -> Chart:
     """Return a chart of the errors of positions on the map and of conventional positions (P1 figures 7 and 10).
 
-    The chart also shows the stated sigma and the protection level.
+    The chart also shows the stated sigma and the protection level of single epochs.
 
     Both tables refer to the same antenna, and are in order of time. `filtered` has the errors of the filter along the
     track.
@@ -83,8 +83,8 @@ def _errors(errors: pl.DataFrame, filtered: pl.DataFrame | None, start: np.datet
     caption = [_SIGN]
     at, sigma = _greatest(x, floats(errors, "along_sigma_m"))
     if len(at):
-        layers.append(Band(label="± stated sigma", colour=CONSTRAINED, x=at, low=-sigma, high=sigma))
-        caption.append("The band is the largest stated standard deviation in each short piece of the axis.")
+        layers.append(Band(label="± sigma of single epochs", colour=CONSTRAINED, x=at, low=-sigma, high=sigma))
+        caption.append("The band is the largest stated sigma of single epochs in each short piece of the axis.")
     levels = []
     drawn_levels = [name for name in level_columns(errors) if np.isfinite(floats(errors, name)).any()]
     for column, colour in zip(drawn_levels, (PURPLE, GREEN, BLACK, GREY), strict=False):
@@ -93,16 +93,18 @@ def _errors(errors: pl.DataFrame, filtered: pl.DataFrame | None, start: np.datet
         if len(at):
             levels.append(most)
             name_of = "protection level" if len(drawn_levels) == 1 else column.removesuffix("_m").replace("_", " ")
-            for sign, label in ((1.0, f"± {name_of}"), (-1.0, "")):
+            for sign, label in ((1.0, f"± {name_of} of single epochs"), (-1.0, "")):
                 layers.append(Curve(label=label, colour=colour, x=at, y=sign * most, width=1.0, dash="dashed"))
-            caption.append(f"The {name_of} is finite at {100 * np.isfinite(level).mean():.1f} % of the epochs.")
+            caption.append(
+                f"The {name_of} of single epochs is finite at {100 * np.isfinite(level).mean():.1f} % of the epochs."
+            )
     failed = errors.filter(~pl.col("status").is_in(PASSED)) if "status" in errors.columns else errors.clear()
     passed = errors.join(failed.select("time_gpst"), on="time_gpst", how="anti") if len(failed) else errors
     series = [(*entry, table) for entry, table in zip(_SERIES, (errors, passed), strict=True)]
     if failed["error_m"].is_not_null().any():
-        series.append(("on the map, failed a check", "error_m", BLACK, "cross", failed))
+        series.append(("single epochs, failed a check", "error_m", BLACK, "cross", failed))
     if filtered is not None:
-        series.append(("filtered along the track", "error_m", FILTERED, "dot", filtered))
+        series.append(("filter along the track", "error_m", FILTERED, "dot", filtered))
     drawn, thinned = thin_points(
         Points(
             label=label, colour=colour, shape=shape, x=axis(table), y=good_errors(table, column),  # type: ignore[arg-type]

@@ -104,7 +104,7 @@ def plan(
     outside = int(np.isfinite(there[:, 0]).sum() - near.sum())
     far = f" Outside the plan: {plural(outside, 'conventional position')}." if outside else ""
     return chart(
-        caption=f"Positions on the map, coloured by {coloured}; conventional positions in grey.{far} Origin at "
+        caption=f"Single-epoch positions, coloured by {coloured}; conventional positions in grey.{far} Origin at "
         f"latitude and longitude {frame.latitude_deg:.5f}, {frame.longitude_deg:.5f}.{thinned}",
         layers=tuple(layers),
     )
@@ -265,7 +265,7 @@ def interval(table: pl.DataFrame, prefix: str = "") -> tuple[Floats, Floats]:
     return at[1:], np.abs(np.diff(at))
 
 
-_FIXES: Final = (("conventional", "conventional_", CONVENTIONAL, "square"), ("on the map", "", CONSTRAINED, "dot"))
+_FIXES: Final = (("conventional", "conventional_", CONVENTIONAL, "square"), ("single epochs", "", CONSTRAINED, "dot"))
 
 
 def interval_over_chainage(table: pl.DataFrame) -> Chart:
