@@ -30,8 +30,8 @@ ANOTHER_DAY: Final = np.timedelta64(24, "h")
 #: Sensors with samples only at events. They may have no samples for a long time, if the train is at rest or passes no
 #: balise or ground unit.
 _OF_EVENTS: Final = ("tachometer", "ranging", "balises")
-#: Longest time from the reference time of a navigation record to an epoch at which the record is usable. Galileo
-#: records have the longest of all constellations, 4 h.
+#: Longest assumed time from the reference time of a navigation record to an epoch at which the record is usable
+#: (Galileo: 4 h).
 RECORD_REACH: Final = np.timedelta64(4, "h")
 
 
@@ -55,7 +55,7 @@ def navigation_span(navigation: Navigation) -> Span | None:
 
 
 def check_each_file(navigation: Navigation, log: Log) -> None:
-    """Raise MismatchError if a file of a log begins more than a day from all navigation records."""
+    """Raise MismatchError if one of the several files of a log begins more than a day from all navigation records."""
     times = navigation_times(navigation)
     for path, first in log.first_epochs() if len(times) else ():
         if np.abs(times - first).min() > ANOTHER_DAY:

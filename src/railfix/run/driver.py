@@ -282,7 +282,7 @@ def _single_epochs(screened: Iterator[Chunk], processor: EpochProcessor) -> Iter
 def _causes(
     tally: Tally, logs: Mapping[Antenna, Log], processor: EpochProcessor, config: Config, line: OpenedLine
 ) -> dict[str, str]:
-    """Return the likely cause ("" if unknown) by antenna, if 90 % of its positions are off or contradict the map."""
+    """Return the likely cause ("" if unknown) by antenna, if at least 90 % of positions are off map or inconsistent."""
     causes: dict[str, str] = {}
     for name in logs:
         antenna = tally.antennas[name]

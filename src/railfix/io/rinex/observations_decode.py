@@ -3,7 +3,7 @@
 A field of sixteen characters fits in two 64-bit words. The value of eight digits in one word is computed by three
 multiplications (L. Lamport, "Multiple byte processing with full-word instructions", CACM 18(8), 1975,
 doi:10.1145/360933.360994). The result is an exact number of thousandths, so its division by 1000 equals
-``float(text)``. Fields that do not have three decimals are read one by one with `float`.
+``float(text)``. Fields of other forms than F14.3 are read one by one with `float`.
 """
 
 from __future__ import annotations

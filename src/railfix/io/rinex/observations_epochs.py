@@ -122,7 +122,7 @@ LABELS: Final = frozenset(
         "PRN / # OF OBS",
     )
 )  # fmt: skip
-#: Upper limit on the number of lines of an epoch, which has less than 1000 satellites.
+#: Upper limit on the number of lines of an epoch, which has fewer than 1000 satellites.
 _MAX_LINES = 1100 * 6
 _CUT_EPOCH_LINE = "the file ends in the middle of an epoch, in its first line"
 
@@ -219,7 +219,7 @@ def _is_record(lines: Lines, line: int) -> bool:
 
 
 def _find_unmarked(lines: Lines, *, lines_per_satellite: int, at_end: bool, log: FaultLog) -> tuple[EpochHeads, int]:
-    """Find RINEX 2 epochs. Only epoch lines have a decimal point in the column of the point of the seconds."""
+    """Find RINEX 2 epochs by the decimal point of the seconds. Other lines have no point in its column."""
     n = len(lines)
     long = np.flatnonzero(lines.length >= epoch_width(2.0))
     likely = long[lines.data[lines.start[long] + 18] == ord(".")]
