@@ -195,7 +195,7 @@ def antenna_results(chunk: Chunk, fusion: Mapping[str, AlongTrack], config: Conf
 
 
 def add_wheel_sign(solution: Solution, interference: Interference, wheel: WheelSigns) -> tuple[Solution, Interference]:
-    """Return positions and interference, with a sign of interference where satellite and wheel distances differ."""
+    """Return positions and interference, with a sign of interference where GNSS and wheel distances differ."""
     causes = np.where(wheel.parted, interference.causes | int(Sign.WHEEL_PARTS), interference.causes)
     interference = replace(interference, causes=causes)
     status = with_statuses(solution.status, [interference.suspicion])

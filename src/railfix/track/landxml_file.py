@@ -175,7 +175,7 @@ def _read_plans(path: str, elements: list[Any], scale: float, crs: str | None) -
             raise InputFileError(
                 path,
                 f"with {orders[chosen]}, the coordinates are in the area of {crs}, but curves do not match "
-                f"their attribute rot; with {orders[1 - chosen]}, the coordinates are outside it; correct rot, or the order",
+                f"their attribute rot; with {orders[1 - chosen]}, the coordinates are outside it; correct rot or order",
             )
     else:
         chosen = int(broken[1] < broken[0])
