@@ -63,7 +63,7 @@ def read_nmea(path: FilePath, *, broken_lines: BrokenLines = "stop", date: np.da
         With "stop", a sentence with a wrong checksum or invalid fields raises InputFileError. With "count", the
         sentence is skipped and noted. A malformed last line is always skipped and noted.
     date : datetime64, optional
-        UTC date of the first GGA sentence, for logs without RMC and ZDA. It overrides the dates in the log.
+        UTC date of the first GGA sentence, for logs without RMC and ZDA. `date` overrides the dates in the log.
 
     Returns
     -------

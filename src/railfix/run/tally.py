@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 
 _NOT_A_REJECTION = Reason.NOT_OBSERVED
-#: Results of the interference check with which an offset of the positions may still be a map error.
+#: If the interference check has one of these results, an offset of the positions may still be a map error.
 _MAP_IN_QUESTION: Final = (Suspicion.NONE, Suspicion.JAMMING_SUSPECTED, Suspicion.CONTRADICTED)
 _NO_RECORD = Reason.NO_EPHEMERIS | Reason.EPHEMERIS_TOO_OLD
 
@@ -91,7 +91,7 @@ class AntennaTally:
     #: bits; the decisive reason is the first after which too few satellites remain. It is `not_observed` if too few
     #: satellites were observed, and `used` if enough remained, but their clocks left no range for the position.
     short_first: Counter[str] = field(default_factory=Counter)
-    #: Number of epochs with too few satellites that would have enough without a rejection reason, by this reason.
+    #: Number of epochs with too few satellites, by rejection reason without which enough would remain.
     short_only: Counter[str] = field(default_factory=Counter)
     #: Number of rejected observations by their first rejection reason.
     first_reason: Counter[str] = field(default_factory=Counter)
@@ -212,7 +212,7 @@ class AntennaTally:
                 counter[str(result.satellite[channel])] += int(of_channel[channel])
 
     def _add_short(self, result: AntennaResult) -> None:
-        """Count the reasons for too few satellites in `short_first` and `short_only`."""
+        """Add the reasons for too few satellites to `short_first` and `short_only`."""
         short = np.flatnonzero(result.status == Status.TOO_FEW_SATELLITES)
         if not len(short):
             return
@@ -395,7 +395,7 @@ def shorten_notes(notes: list[str]) -> list[str]:
 
 
 class Replays:
-    """Filter input for smoothing, in a temporary file. The file is deleted at the end of the object or the process."""
+    """Filter input for smoothing, in a temporary file that is deleted with this object or when the process ends."""
 
     def __init__(self) -> None:
         self._file = tempfile.TemporaryFile()  # noqa: SIM115  open as long as the run

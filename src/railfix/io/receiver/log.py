@@ -160,7 +160,7 @@ _BLOCK_BYTES = 1 << 22
 
 
 def read_receiver_positions(path: FilePath, *, date: np.datetime64 | None = None) -> PositionLog:
-    """Read a receiver's positions. UBX logs without a dated NAV-PVT message need a `date` within half a week."""
+    """Read a receiver's positions. A UBX log without dated NAV-PVT requires a `date` within half a week of the log."""
     parts = []
     near = np.datetime64("NaT", "ns") if date is None else date.astype("datetime64[ns]")
     undated, rest = 0, b""

@@ -243,7 +243,7 @@ def _glonass_slots(channels: Mapping[str, int]) -> list[str]:
 
 @dataclass(frozen=True)
 class _WrittenRows:
-    """Satellites and columns of one constellation, and the channels written in them."""
+    """Satellites and columns of one constellation, and the channel of each satellite and column."""
 
     satellites: tuple[str, ...]
     columns: tuple[str, ...]
