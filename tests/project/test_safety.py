@@ -85,6 +85,6 @@ def test_the_report_has_hazards_and_requirements_with_their_results(tmp_path: Pa
     )
     text = report([path], "ranges: 39 of 40 mutants killed")
     assert "| H5 | a map is read incorrectly | FAILED, 1 failed |" in text
-    assert "| H11 | damaged input is taken as valid data | shown, 1 passed |" in text
+    assert "| H11 | damaged input is used as valid data | shown, 1 passed |" in text
     assert re.search(r"^\| A1 \| .* not run \|$", text, flags=re.MULTILINE)
     assert "- ranges: 39 of 40 mutants killed" in text

@@ -36,7 +36,7 @@ def validate_point(point: SinglePoint, ranges: Ranges, noise_scale: Floats, *, l
     """Return the `PointStatus` of each conventional position, shape (T,).
 
     `noise_scale`, shape (T,), is the ratio of the receiver's range standard deviation to the sigmas of the weights. The
-    checks are those of RTKLIB's `valsol`; one clock per constellation is assumed.
+    checks are the same as in pntpos.c (RTKLIB: `valsol`); one clock per constellation is assumed.
     """
     test = detect(
         point.wsse, point.residual_m, ranges.space_redundancy, scale=noise_scale,

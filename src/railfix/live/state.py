@@ -132,7 +132,7 @@ def load_state(path: Path, under: Mapping[str, Any]) -> Loaded:
     except StateFormatError as error:
         return _refuse(path, f"contains no state ({error})")
     if not isinstance(session, SavedSession):
-        return _refuse(path, "contains no session state")
+        return _refuse(path, "contains no state")
     return Loaded(session=session, outcome=f"state file {path}: belongs to this map, vehicle and settings")
 
 

@@ -59,7 +59,7 @@ def compute_information(axes: Floats, sigma_plan_m: float, sigma_height_m: float
 def robust_fit(
     ranges: Ranges, place_ecef_m: Floats, *, information: Floats | None = None, limits: RobustFitLimits | None = None
 ) -> RobustFit:
-    """Find the ranges of each epoch that agree with each other by a robust fit with IGG-III weights.
+    """Find the ranges of each epoch that agree with each other by IGG-III weights (Yang, Song and Xu, 2002).
 
     `place_ecef_m`, shape (T, 3), are the positions at which the ranges are linearised.
 

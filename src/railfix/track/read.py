@@ -136,7 +136,7 @@ def check_heights(
         raise InputFileError(
             flat[0].source,
             "the coordinates have no height; give heights (--heights): a profile by chainage; a log of 3-D positions; "
-            "`log`, in railfix run, for the heights of the log's own positions; or a raster with height_datum "
+            "`log`, in railfix run, for the heights of the log's own positions; or a raster file with height_datum "
             "(--height-datum), sigma_height_m (--height-sigma) and, for orthometric heights, geoid (--geoid) "
             f"({GEOIDS})",
         )
