@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Future, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -61,9 +62,8 @@ def folder(good: Desk, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_runs_are_found_by_the_fields_of_the_patterns(folder: Path, tmp_path: Path) -> None:
     runs = read_campaign(folder / "campaign.toml", tmp_path)
-    assert [tuple(run.fields.values()) for run in runs] == [
-        (train, day) for train in "AB" for day in ("2024-03-05", "2024-03-06")
-    ]
+    fields = [(train, day) for train in "AB" for day in ("2024-03-05", "2024-03-06")]
+    assert [tuple(run.fields.values()) for run in runs] == fields
     for run in runs:
         assert run.inputs.nav == (folder / "nav" / f"{run.fields['day']}.nav",)
         assert run.inputs.front == (folder / "logs" / run.fields["train"] / run.fields["day"] / "front.obs",)
@@ -74,11 +74,9 @@ def test_runs_are_found_by_the_fields_of_the_patterns(folder: Path, tmp_path: Pa
 
 def test_a_failed_run_is_a_row_and_a_campaign_goes_on_where_it_was(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    seen = []
-    with ThreadPoolExecutor(1) as executor:
-        first = run_campaign(
-            folder / "campaign.toml", out=out, executor=executor, progress=lambda **state: seen.append(state)
-        )
+    seen, threads = [], ThreadPoolExecutor(1)
+    position = partial(run_campaign, out=out, executor=threads, progress=lambda **state: seen.append(state))
+    first = position(folder / "campaign.toml")
     assert first["status"].to_list() == ["done", "done", "failed", "done"]
     assert "front.obs" in first["error"][2]
     assert [(state["done"], state["failed"]) for state in seen] == [(1, 0), (2, 0), (3, 1), (4, 1)]
@@ -90,10 +88,7 @@ def test_a_failed_run_is_a_row_and_a_campaign_goes_on_where_it_was(folder: Path,
     shutil.rmtree(out / "runs/train=A/day=2024-03-06")
     before = record.stat().st_mtime_ns
     seen.clear()
-    with ThreadPoolExecutor(1) as executor:
-        again = run_campaign(
-            folder / "campaign.toml", out=out, executor=executor, progress=lambda **state: seen.append(state)
-        )
+    again = position(folder / "campaign.toml")
     # two were there, and the failed one and the removed one are positioned again: none is counted as the first
     assert [(state["done"], state["kept"], state["failed"]) for state in seen] == [(3, 2, 0), (4, 2, 1)]
     assert record.stat().st_mtime_ns == before
@@ -101,11 +96,12 @@ def test_a_failed_run_is_a_row_and_a_campaign_goes_on_where_it_was(folder: Path,
     assert again.select(compared).equals(first.select(compared), null_equal=True)
 
     changed = folder / "strict.toml"
-    changed.write_text(CAMPAIGN.replace("[options]", 'config = "settings.toml"\n[options]'))
     (folder / "settings.toml").write_text('preset = "strict"\n')
-    with ThreadPoolExecutor(1) as executor:
-        run_campaign(changed, out=out, executor=executor)
-    assert record.stat().st_mtime_ns != before
+    for options in ("[options]\nend = 2024-03-05T03:10:05", 'config = "settings.toml"\n[options]'):
+        changed.write_text(CAMPAIGN.replace("[options]", options))
+        position(changed)
+        assert record.stat().st_mtime_ns != before
+        before = record.stat().st_mtime_ns
 
 
 @pytest.mark.slow

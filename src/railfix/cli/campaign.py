@@ -84,7 +84,8 @@ def campaign(
     Each run has a folder with the files of `railfix run`, such as `DIR/runs/train=A/day=2024-03-05/`; together, these
     folders are one hive-partitioned data set. `campaign.csv` has one row per run, with the error message of a run that
     fails. The page `campaign.html` shows the lines, the protection levels and (with `reference`) the errors of each
-    run, and explains the ten worst epochs. A run is not repeated if results for the same inputs and settings exist.
+    run, and explains the ten worst epochs. A run is not repeated if results for the same inputs, settings and options
+    exist.
 
     Example: `railfix campaign line.toml --out results --workers 8`
 
@@ -215,7 +216,7 @@ def benchmark(
     evaluate`. A case with `held_out` is reserved for the benchmark: settings derived from its files are rejected.
 
     `benchmark.csv`, `benchmark.json`, `benchmark.md` and the folders of the runs are written into DIR. A run is not
-    repeated if results for the same inputs and settings exist.
+    repeated if results for the same inputs, settings and options exist.
 
     Example: `railfix benchmark cases --out benchmark`
 

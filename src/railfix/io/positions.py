@@ -88,7 +88,7 @@ def _parse_novatel(text: list[str], path: FilePath) -> PositionLog:
             raise InputFileError(path, f"the {name} log cannot be read", line=number) from None
         lines.append(number)
     if not rows:
-        raise InputFileError(path, "there is no BESTPOSA, INSPVAA, INSPVASA or INSPVAXA log with a position")
+        raise InputFileError(path, "there is no BESTPOSA, BESTGNSSPOSA, INSPVAA, INSPVASA or INSPVAXA with a position")
     values = np.array(rows, dtype=np.float64)
     return PositionLog(
         path=str(path),

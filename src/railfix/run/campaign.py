@@ -78,11 +78,12 @@ class CampaignRun:
 
     @property
     def done(self) -> bool:
-        """Whether the results folder already has results for the inputs and settings of this run."""
+        """Whether the results folder already has results for the inputs, settings and options of this run."""
         try:
             record = read_record(self.out)
             record.check_inputs()
             same = record.inputs.paths == self.inputs.with_settings(self.config).paths
+            same = same and record.options.replaced(overwrite=self.options.overwrite) == self.options
             return same and record.record.get("settings_used") == self.config.as_dict()
         except (InputFileError, MismatchError):
             return False
@@ -158,9 +159,10 @@ def run_campaign(
 ) -> pl.DataFrame:
     """Position all logs of a campaign file. Write a table with one row per run to ``campaign.csv``, and return it.
 
-    Runs that already have results for the same inputs and settings are not repeated, so the same call continues an
-    interrupted campaign. The columns of the table are the fields, `status` ("done", "failed"), `error` (message of a
-    failed run), `epochs`, `positioning_rate`, `ok_rate`, `wall_s`, `reference` and `folder` (below `out`).
+    Runs that already have results for the same inputs, settings and options are not repeated, so the same call
+    continues an interrupted campaign. The columns of the table are the fields, `status` ("done", "failed"), `error`
+    (message of a failed run), `epochs`, `positioning_rate`, `ok_rate`, `wall_s`, `reference` and `folder` (below
+    `out`).
 
     `reading`, if it differs from the default, replaces the reading options in the campaign file. `executor` is a
     `concurrent.futures.Executor`; its workers must have access to the same files. `lost` are the exceptions by which

@@ -31,8 +31,8 @@ ANOTHER_DAY: Final = np.timedelta64(24, "h")
 #: balise or ground unit.
 _OF_EVENTS: Final = ("tachometer", "ranging", "balises")
 #: Longest assumed time from the reference time of a navigation record to an epoch at which the record is usable
-#: (Galileo: 4 h).
-RECORD_REACH: Final = np.timedelta64(4, "h")
+#: (BeiDou: 6 h, `gnss.orbits.prepared_records.VALIDITY_S`).
+RECORD_REACH: Final = np.timedelta64(6, "h")
 
 
 #: First and last time of a log, or of messages or navigation records.

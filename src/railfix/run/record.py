@@ -302,11 +302,11 @@ def budget_tables(antennas: Mapping[str, Facts], basis: str) -> list[Table]:
     """
     filtered = {name: facts["filter"] for name, facts in antennas.items() if facts.get("filter")}
     caption = "Single epochs (positions.csv)" if filtered else "Epochs by status"
-    tables = [_filter_table(filtered)] if filtered else []
+    tables = [_filter_table(filtered, basis)] if filtered else []
     return [*tables, _epochs_table(antennas, basis, caption), _ranges_table(antennas)]
 
 
-def _filter_table(filtered: Mapping[str, Facts]) -> Table:
+def _filter_table(filtered: Mapping[str, Facts], basis: str) -> Table:
     found = list(filtered.values())
     rows = [
         [status, *(count(each["status"][status]) for each in found)]
@@ -315,7 +315,7 @@ def _filter_table(filtered: Mapping[str, Facts]) -> Table:
     rows += _metres("sigma along the line", [each.get("along_sigma_m") for each in found], _OF_SIGMA)
     levels = [each.get("level") for each in found]
     if any(levels):
-        rows += _metres("indicative protection level", levels, _OF_LEVEL)
+        rows += _metres(f"{basis} level", levels, _OF_LEVEL)
         for limit in WITHIN_M:
             counts = (None if level is None else level.get(f"within_{limit}_m") for level in levels)
             rows.append([f"  within {limit} m", *(count(each) for each in counts)])

@@ -331,7 +331,8 @@ def positions(frames: Frames) -> dict[str, np.ndarray]:
     geodetic = len(frames.of("sbf", PVT_GEODETIC)) > 0
     _, rows = frames.structures("sbf", [PVT_GEODETIC if geodetic else PVT_CARTESIAN], _PVT)
     mode = rows["mode"] & 15
-    rows = rows[(rows["error"] == 0) & np.isin(mode, list(_QUALITY)) & (rows["tow_ms"] != _NO_TIME)]
+    timed = (rows["tow_ms"] != _NO_TIME) & (rows["week"] != _NO_WEEK)
+    rows = rows[(rows["error"] == 0) & np.isin(mode, list(_QUALITY)) & timed]
     place = rows["place"]
     if geodetic:
         place = ecef_from_geodetic(np.degrees(place[:, 0]), np.degrees(place[:, 1]), place[:, 2])
