@@ -103,9 +103,9 @@ def stop_orders(state: Interlocking) -> dict[int, str]:
 def points_reported(state: Interlocking, point: PointName, detected: int | None, layout: Layout) -> Interlocking:
     """Return the state after points were reported as detected for track `detected`, or as undetected (None).
 
-    Trains that lock the points are stopped if the detection of the points is lost. After a start, trains over the
-    points are stopped if the detected position is not the commanded one. Points that no train locks remain in their
-    detected position.
+    Trains that lock the points are stopped if the detection of the points is lost. If points without detection are
+    detected again, but not in the commanded position, the trains over the points are stopped. Points that no train
+    locks remain in their detected position.
     """
     before = state.points[point]
     after = replace(before, detected=detected)
