@@ -46,7 +46,7 @@ def test_satellites_and_constellations(log: Observations) -> None:
         with pytest.raises(KeyError, match="is not a GPS time"):
             log[bound:]  # type: ignore[misc]
     for rows in ("G06", 5, [1, 2]):
-        with pytest.raises(KeyError, match=r"is not a range of epochs, such as log\[10:20\]"):
+        with pytest.raises(KeyError, match=r"is not a range of epochs such as log\[10:20\]"):
             log[rows]  # type: ignore[index]
 
 

@@ -315,7 +315,7 @@ def test_only_a_fresh_word_of_the_integrity_device_confirms(tmp_path: Path) -> N
     ("old", "new", "named"),
     [
         ("end_m = 400", "end_m = 500", "station A"),
-        ("length_m = 80", "length_m = 40", "train 1 is 40 m, in the database 80 m"),
+        ("length_m = 80", "length_m = 40", "train 1 is 40 m, but was 80 m in the database"),
         ("number = 1", "number = 2", "train 1 is absent"),
     ],
 )

@@ -61,7 +61,7 @@ def test_the_story_of_the_demonstration(demo: tuple[dict[str, Any], dict[str, An
     assert 0.0 < figures["suspended and stop ordered [s]"] - FAULT_S <= 6.0
     assert figures["both trains at rest [s]"] > figures["suspended and stop ordered [s]"] + 10.0  # they were running
     assert 0.7 * figures["reports sent"] < figures["reports used"] <= figures["reports sent"]
-    assert figures["times shown by simulated running"] >= 1
+    assert figures["times that a position was simulated"] >= 1
     assert state["monitor"]["stopped"]
     log = state["log"]
     order = [k for k, line in enumerate(log) if line.endswith(("suspend satellite positioning", "triangle: stop"))]
@@ -212,7 +212,7 @@ class Browser:
 
 
 def test_orders_need_a_log_in(demo: tuple[dict[str, Any], dict[str, Any]]) -> None:
-    answers, asked = iter(["healthy for 3 s of the 300 s before a release", None]), []
+    answers, asked = iter(["fixes are healthy for 3 s; a release requires 300 s", None]), []
 
     def release(_: dict[str, Any], by: str) -> str | None:
         asked.append(f"release by {by}")
@@ -234,7 +234,7 @@ def test_orders_need_a_log_in(demo: tuple[dict[str, Any], dict[str, Any]]) -> No
         assert desk.post("orders/route", {"train": 1})[0] == 403
         assert asked == []
         assert desk.post("login", {"password": "secret"}) == (200, None)
-        assert desk.post("orders/release") == (409, "healthy for 3 s of the 300 s before a release")
+        assert desk.post("orders/release") == (409, "fixes are healthy for 3 s; a release requires 300 s")
         assert desk.post("orders/release") == (200, None)
         assert desk.post("orders/route", {"train": 2}) == (200, None)
         assert desk.post("orders/route", {"train": 2}, kind="text/plain")[0] == 400

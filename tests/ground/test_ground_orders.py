@@ -287,7 +287,7 @@ def test_a_field_that_does_not_answer_stops_the_trains_on_its_points(desk: Desk)
     desk.steps(9.0)
     assert desk.state.trains[2].stop is None
     desk.steps(2.0)
-    assert desk.state.trains[2].stop == "the field does not answer for points of its route"
+    assert desk.state.trains[2].stop == "the trackside does not answer for points of its route"
     assert desk.state.trains[1].stop is None
 
 
@@ -307,7 +307,7 @@ def test_nothing_is_granted_after_a_start_until_every_train_is_heard(desk: Desk)
     ends = {number: known.end_m for number, known in desk.state.trains.items()}
     desk.steps(2.0)
     assert {number: known.end_m for number, known in desk.state.trains.items()} == ends
-    assert any("nothing is granted until" in alarm for alarm in desk.centre.alarms)
+    assert any("no authorities are extended until" in alarm for alarm in desk.centre.alarms)
     desk.report(1, 1500.0, authority=900, authority_end_cm=245_000, speed_cmps=1000, direction=1, standstill=False)
     assert "the newest in the centre's database at the last start was" in (desk.state.trains[1].stop or "")
     assert desk.state.trains[1].interval_m[1] == 2450.0  # what it may still run to is occupied
@@ -659,7 +659,7 @@ def test_a_start_on_board_with_a_clock_an_hour_back_goes_on_with_a_word(desk: De
     desk.report(1, 401.0, session=5, time_ns=time_ns, sent_ns=time_ns)
     assert desk.state.trains[1].stop is None
     assert desk.state.trains[1].front_m == 406.0
-    assert any("train 1: started again on board" in line for line in desk.centre.lines)
+    assert any("train 1: on-board unit restarted" in line for line in desk.centre.lines)
     desk.report(1, 402.0, session=5, sent_ns=time_ns - 2_000_000_000, time_ns=time_ns)
     assert "set the train's clock" in (desk.centre.snapshot()["trains"][0]["rejected"] or "")
 

@@ -128,7 +128,7 @@ def test_a_wrong_change_of_ends_in_the_next_station_sets_no_other_track(monkeypa
 @pytest.mark.parametrize(
     ("changes", "reason", "furthest_m"),
     [
-        ({"facing": -1, "direction": 1}, "the train has changed ends while it runs", 4000.0),
+        ({"facing": -1, "direction": 1}, "the train has changed ends while running", 4000.0),
         (
             {"facing": -1, "direction": 0, "standstill": True, "speed_cmps": 0, "chainage_cm": 420_000},
             "the train has changed ends and is beyond its interval",
@@ -136,7 +136,7 @@ def test_a_wrong_change_of_ends_in_the_next_station_sets_no_other_track(monkeypa
         ),
         (
             {"authority": 8, "authority_end_cm": 300_000},
-            "has authority 8, the newest in the centre's database is 7",
+            "has authority 8, but the newest in the centre's database is 7",
             4000.0,
         ),
         (

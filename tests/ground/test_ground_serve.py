@@ -370,7 +370,7 @@ def test_routes_and_the_release_by_hand(centre: tuple[ControlCentre, list[Author
     seconds(1, TriangleVerdict.HEALTHY)
     assert sent[-1].stopped  # a first start has to be released
     assert orders["route"]({"train": 1}) == "satellite positioning is suspended"
-    assert (orders["release"]({}) or "").startswith("healthy for 0 s")
+    assert (orders["release"]({}) or "").startswith("fixes are healthy for 0 s")
     seconds(6, TriangleVerdict.HEALTHY)
     assert orders["release"]({}) is None
     seconds(1, TriangleVerdict.HEALTHY)
@@ -607,7 +607,7 @@ def test_a_train_that_nobody_answers_says_so(folder: Path) -> None:
         (('station = "A"', 'station = "X"'), "points of X (none, the stations are A, B, C)"),
         (("listen", "lisen"), "unknown setting lisen"),
         ((":", ";"), "HOST:PORT was expected"),
-        (('keys = "keys"', 'keys = "none"'), "create it by railfix ground keys"),
+        (('keys = "keys"', 'keys = "none"'), "create it with railfix ground keys"),
     ],
 )
 def test_a_wrong_file_of_a_centre_is_one_sentence(

@@ -223,7 +223,7 @@ def test_healthy_time_begins_again_after_an_absent_fix() -> None:
     state, _ = advance(MonitorState(stopped=False), 0.0, TriangleVerdict.GROUND_LOST, limits=TIMES)
     for now in range(1, 301):
         state, _ = advance(state, float(now), None if now == 150 else TriangleVerdict.HEALTHY, limits=TIMES)
-    assert release(state, 300.0, limits=TIMES)[2] == "healthy for 149 s of the 300 s before a release"
+    assert release(state, 300.0, limits=TIMES)[2] == "fixes are healthy for 149 s; a release requires 300 s"
 
 
 def test_nothing_from_a_receiver_stops_after_the_late_time() -> None:

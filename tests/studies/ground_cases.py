@@ -59,7 +59,7 @@ SCRIPTS: Final[dict[str, tuple[list[str], str]]] = {
     # the train is freed by the order `correct-train`: test_an_order_frees_a_line_that_a_wrong_report_has_stopped
     "quick": (
         ["python quick.py"],
-        "brake_reason 40.0 m/s, above the .* brake_reason 60.0 m/s, above the .* False 20.0 "
+        "brake_reason 40.0 m/s exceeds .* brake_reason 60.0 m/s exceeds .* False 20.0 "
         "the report states standstill and a speed of 20.0 .* None Rejection.FAR_AHEAD Rejection.FAR_AHEAD None",
     ),
     "clockback": (
@@ -70,7 +70,7 @@ SCRIPTS: Final[dict[str, tuple[list[str], str]]] = {
             END, "python log.py w/run/*.db",
         ],
         "clock 0.0 reports, authorities \\(\\d+, [1-9]\\d*\\) .* -3600.0 .* \\(\\d+, [1-9]\\d*\\) .*"
-        " 3600.0 .* \\(\\d+, [1-9]\\d*\\) .*started again on board.*started again on board",
+        " 3600.0 .* \\(\\d+, [1-9]\\d*\\) .*on-board unit restarted.*on-board unit restarted",
     ),
     "negative_chunk": (["python negative_chunk.py"], "CPU in 5 s: 0[.].* SIGTERM -> rc 143 messages [1-9]"),
     "p5": (

@@ -20,10 +20,10 @@ MAX_PROBLEMS: Final = 50  #: Largest number of messages on individual faults; fu
 
 
 def channels_with_data(kinds: Iterable[Floats], loss_of_lock: Bytes) -> Masks:
-    """Return whether a channel has a value in any array of `kinds` (T, M), or a loss-of-lock indicator; shape (M,)."""
+    """Return whether each channel has a value in any array of `kinds`, or a loss-of-lock indicator; shape (M,)."""
     used = np.zeros(loss_of_lock.shape[1], dtype=np.bool_)
     for array in kinds:
-        used |= ~np.isnan(array[:1]).all(axis=0)  # fast check: nearly all channels have data in the first epoch
+        used |= ~np.isnan(array[:1]).all(axis=0)  # for speed; nearly all channels have data in the first epoch
         rest = np.flatnonzero(~used)
         used[rest] = ~np.isnan(array[:, rest]).all(axis=0)
     rest = np.flatnonzero(~used)
@@ -64,7 +64,7 @@ def concatenate(parts: Sequence[Observations]) -> Observations:
 
 
 def stack_parts(parts: Sequence[Observations]) -> Observations:
-    """Stack observations of one or several receivers as `concatenate` does, but allow any order in time."""
+    """Join observations of one or several receivers as `concatenate` does, but with the parts in any order of time."""
     if not parts:
         raise ValueError("concatenate needs at least one part")
     of_parts = [list(zip(p.satellite.tolist(), p.signal.tolist(), strict=True)) for p in parts]
@@ -117,7 +117,7 @@ def _join_headers(headers: Sequence[ObservationHeader]) -> ObservationHeader:
 
 
 def stack_observations(observations: Sequence[Observations]) -> tuple[Observations, tuple[slice, ...]]:
-    """Stack the epochs of several antennas, with the union of their channels; also return the rows of each antenna."""
+    """Stack the epochs of several antennas, with the union of their channels; also return the rows by antenna."""
     first, *others = observations
     if not others:
         return first, (EVERY,)
@@ -126,18 +126,18 @@ def stack_observations(observations: Sequence[Observations]) -> tuple[Observatio
         (each.satellite.tobytes(), each.signal.tobytes(), *sorted(each.header.glonass_channel.items()))
         for each in observations
     }
-    same = len(keys) == 1  # channels, their order and GLONASS frequencies are equal
+    same = len(keys) == 1  # the channels and GLONASS frequencies of all antennas are equal
     stacked = join_epochs(observations) if same else stack_parts(observations)
     return stacked, tuple(slice(a, b) for a, b in pairwise(ends))
 
 
 def signals_by_system(satellite: Strings, signal: Strings) -> dict[str, tuple[str, ...]]:
-    """Return the signals of the channels by constellation letter, sorted (`ObservationHeader.signals`)."""
+    """Return the sorted signals of each constellation letter, as in `ObservationHeader.signals`."""
     pairs = sorted(set(zip(satellite.astype("<U1").tolist(), signal.tolist(), strict=True)))
     return {system: tuple(name for _, name in group) for system, group in groupby(pairs, key=itemgetter(0))}
 
 
 def first_problems(messages: Iterable[str], *, count: int) -> tuple[str, ...]:
-    """Return the first `MAX_PROBLEMS` messages on `count` faults, and a message with the number of further faults."""
+    """Return at most `MAX_PROBLEMS` messages, and one with the number of the other faults; `count` faults in all."""
     kept = tuple(islice(messages, MAX_PROBLEMS))
     return (*kept, f"and {count - len(kept)} more problems") if count > len(kept) else kept

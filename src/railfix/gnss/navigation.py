@@ -17,7 +17,7 @@ from railfix.core.notebook import NotebookTable, plural, time_span_text
 
 
 def _records_text(satellite: Strings, toe: Datetimes) -> str:
-    """Summarize records by number, satellites, constellations and time span, for `repr`."""
+    """Return a text for `repr`: number of records, satellites, constellations and time span."""
     satellites = np.unique(satellite)
     systems = "".join(np.unique(satellites.astype("<U1")).tolist())
     text = f"{plural(satellite, 'record')} of {plural(satellites, 'satellite')}"
@@ -25,7 +25,7 @@ def _records_text(satellite: Strings, toe: Datetimes) -> str:
 
 
 class _NavigationRecords(FrozenArrays, NotebookTable):
-    """Base of broadcast records, with length, `repr` and read-only arrays."""
+    """Base class of record tables; it defines the length and `repr`, and makes the arrays read-only."""
 
     satellite: Strings
     toe: Datetimes
@@ -53,7 +53,7 @@ class KeplerRecords(_NavigationRecords):
     toe: Datetimes
     #: Transmission time of the message; NaT where the file has none or an implausible time; shape (n,).
     transmitted: Datetimes
-    #: Clock polynomial [s, s/s, s/s^2]; shape (n,).
+    #: Coefficients of the satellite clock polynomial [s, s/s, s/s^2]; shape (n,).
     af0_s: Floats
     af1: Floats
     af2: Floats
@@ -70,16 +70,16 @@ class KeplerRecords(_NavigationRecords):
     #: Rates of the semi-major axis and of delta_n; 0 in messages without rates; shape (n,) [m/s, rad/s^2].
     a_dot: Floats
     delta_n_dot: Floats
-    #: Harmonic corrections [rad, rad, m, m, rad, rad]; shape (n,).
+    #: Amplitudes of the harmonic corrections [rad, rad, m, m, rad, rad]; shape (n,).
     cuc: Floats
     cus: Floats
     crc: Floats
     crs: Floats
     cic: Floats
     cis: Floats
-    #: Toe in seconds of the constellation's own week (BDT for BeiDou), for the longitude of the node; shape (n,).
+    #: Toe in seconds of the constellation's week (BDT for BeiDou), used for the longitude of the node; shape (n,).
     toe_sow_s: Floats
-    #: Broadcast health: GPS/QZSS SV health (CNAV: L1, L2, L5), Galileo 9-bit word, BeiDou SatH1 (CNV: HS); shape (n,).
+    #: Health: SV health of GPS, QZSS (CNAV: bits of L1, L2, L5), 9 bits of Galileo, SatH1 (CNV: HS) of BeiDou; (n,).
     health: Integers
     #: URA or SISA as in the file; nominal value of the URA_ED index for CNAV, NaN for CNV1 to CNV3; shape (n,).
     accuracy_m: Floats
@@ -92,10 +92,10 @@ class KeplerRecords(_NavigationRecords):
     #: D1 and D2: TGD1 and TGD2. CNV1 and CNV2: TGD_B1Cp and TGD_B2ap. CNV3: TGD_B2bI and NaN.
     group_delay_1_s: Floats
     group_delay_2_s: Floats
-    #: Inter-signal corrections: GPS/QZSS L1 C/A, L2C, L5I5, L5Q5, L1C_D, L1C_P; BeiDou B1C_D and B2a_D; NaN elsewhere;
-    #: shape (n, 6).
+    #: Inter-signal corrections, shape (n, 6). Columns of GPS and QZSS: L1 C/A, L2C, L5I5, L5Q5, L1C_D, L1C_P. Columns
+    #: of BeiDou: B1C_D and B2a_D. Other values are NaN.
     inter_signal_s: Floats
-    #: GPS/QZSS fit interval in hours (QZSS flag 0 -> 2, 1 -> 4; GPS flag 0 -> 4); NaN elsewhere; shape (n,) [h].
+    #: Fit interval of GPS and QZSS (QZSS flag 0 -> 2, 1 -> 4; GPS flag 0 -> 4), otherwise NaN; shape (n,) [h].
     fit_interval_h: Floats
 
 
@@ -105,10 +105,10 @@ class GlonassRecords(_NavigationRecords):
 
     satellite: Strings  #: Name of the satellite, such as "R01"; shape (n,).
     toe: Datetimes  #: Reference time, converted from UTC to GPS time; shape (n,).
-    transmitted: Datetimes  #: Message frame time, GPS time; NaT when absent; shape (n,).
-    clock_bias_s: Floats  #: -tau_n, the correction to be added, as in RINEX; shape (n,).
-    relative_frequency: Floats  #: +gamma_n, shape (n,).
-    #: State at toe in PZ-90; the acceleration is the luni-solar part only; shape (n, 3).
+    transmitted: Datetimes  #: Message frame time in GPS time, NaT if absent; shape (n,).
+    clock_bias_s: Floats  #: Satellite clock offset -tau_n, as in RINEX; shape (n,).
+    relative_frequency: Floats  #: Relative frequency offset +gamma_n of the satellite clock, shape (n,).
+    #: Position, velocity and luni-solar acceleration at toe in PZ-90; shape (n, 3).
     position_ecef_m: Floats
     velocity_ecef_mps: Floats
     acceleration_ecef_mps2: Floats
@@ -121,7 +121,7 @@ class GlonassRecords(_NavigationRecords):
 class PreciseEphemeris(NotebookTable):
     """Positions and clocks from SP3, E epochs by N satellites."""
 
-    time: Datetimes  #: GPS time (files in another time system are converted), shape (E,).
+    time: Datetimes  #: Epochs, converted to GPS time if necessary; shape (E,).
     satellite: Strings  #: Name of the satellite, shape (N,).
     position_ecef_m: Floats  #: Position; NaN where the file has none (0.000000), shape (E, N, 3).
     clock_s: Floats  #: Clock offset; NaN where the file has none (999999.999999), shape (E, N).
@@ -152,7 +152,7 @@ class Navigation(NotebookTable):
     #: that are all zero count as not received, and are omitted with a note.
     klobuchar: Mapping[str, Floats] = field(default_factory=dict)
     leap_seconds: int | None = None  #: GPST - UTC [s] from the header.
-    #: Number of records skipped, by kind ("S", "I", "G CNAV", "duplicate").
+    #: Number of skipped records by kind: constellation ("S", "I"), message ("G CNAV") or "duplicate".
     skipped: Mapping[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()  #: Remarks for the user, such as on rejected records.
     precise: PreciseEphemeris | None = None  #: Ephemeris that replaces the broadcast orbits and clocks, if any.

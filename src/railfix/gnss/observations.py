@@ -1,6 +1,6 @@
-"""Observations of one receiver as read-only arrays, and carrier frequencies.
+"""Carrier frequencies, and observations of one receiver as read-only arrays.
 
-Axis 0 is time, and axis 1 is the channel, which is one satellite on one signal. Absent values are NaN; 0 is a value.
+Axis 0 is time, and axis 1 is the channel: one signal of one satellite. Absent values are NaN; 0 is a measured value.
 """
 
 from __future__ import annotations
@@ -85,21 +85,21 @@ class Observations(NotebookTable):
     code_m: Floats  #: Pseudorange, shape (T, M).
     phase_cycles: Floats  #: Carrier phase, shape (T, M).
     doppler_hz: Floats  #: Doppler shift, positive when the satellite approaches; shape (T, M).
-    cn0_dbhz: Floats  #: Carrier-to-noise density; NaN where only the RINEX 1-9 digit exists; shape (T, M).
+    cn0_dbhz: Floats  #: Carrier-to-noise density; NaN if only a signal strength of 1 to 9 is known; shape (T, M).
     loss_of_lock: Bytes  #: RINEX loss-of-lock indicator of the phase, 0 where blank or absent; shape (T, M).
     #: Whether an epoch must not be differenced with the previous epoch: after a power failure (epoch flag 1), with a
-    #: moving antenna or at a new site (flags 2 and 3), or at the start of another file after a gap; shape (T,).
+    #: moving antenna or at a new site (flags 2 and 3), or if a new file begins here after a gap; shape (T,).
     break_before: Masks
     #: Interference indicated by the receiver: 0 none, 1 jamming, 2 spoofing, 3 both; shape (T,).
     receiver_alarm: Bytes = field(default_factory=lambda: np.zeros(0, dtype=np.uint8))
     #: Front-end gain, in the receiver's unit, NaN where unknown; shape (T,).
     front_end_gain: Floats = field(default_factory=lambda: np.zeros(0))
     header: ObservationHeader = field(default_factory=ObservationHeader)
-    #: Messages on skipped faults of the file (file, line, fault): at most `MAX_PROBLEMS`, then one with the number of
-    #: further faults. A slice of epochs has no messages.
+    #: Messages on faulty parts of the file, which were skipped (file, line, fault): at most `MAX_PROBLEMS`, then one
+    #: with the number of further faults. Selected epochs (`log[10:20]`) have no messages.
     problems: tuple[str, ...] = ()
     problem_count: int = 0  #: Number of all faults, with and without a message.
-    #: Number of items skipped, by kind: malformed epochs and satellite lines, duplicate epochs, external events,
+    #: Number of skipped items by kind: malformed epochs and satellite lines, duplicate epochs, external events,
     #: satellites of unknown or unselected constellations.
     skipped: Mapping[str, int] = field(default_factory=dict)
 
@@ -136,11 +136,11 @@ class Observations(NotebookTable):
         return self.satellite.astype("<U1")
 
     def __getitem__(self, key: slice | tuple[slice, str | Sequence[str]]) -> Observations:
-        """Select epochs (a view), or epochs and satellites: ``log[:60]``, ``log["06:34":"06:35", "G06"]``.
+        """Select epochs (views), or epochs and satellites (copies): ``log[:60]``, ``log["06:34":"06:35", "G06"]``.
 
-        Bounds are epoch indices, or times: ``datetime64``, "2021-05-17T06:34:12", or a time of day, which may be on the
-        day of the first epoch or the day after. The upper bound is not included. Satellites are names ("G06") or
-        constellations ("G"), one or several.
+        Bounds are epoch indices, or times: ``datetime64``, "2021-05-17T06:34:12", or a time of day (on the next day if
+        over 12 h before the first epoch). The upper bound is excluded. Satellites are one or several names ("G06") or
+        constellations ("G").
 
         Raises
         ------
@@ -149,7 +149,7 @@ class Observations(NotebookTable):
         """
         rows, names = key if isinstance(key, tuple) else (key, None)
         if not isinstance(rows, slice):
-            raise KeyError(f"{rows!r} is not a range of epochs, such as log[10:20]; satellites are log[:, 'G01']")
+            raise KeyError(f"{rows!r} is not a range of epochs such as log[10:20]; select satellites by log[:, 'G01']")
         start, stop = (
             bound if bound is None or hasattr(bound, "__index__") else self._epoch_at(bound)
             for bound in (rows.start, rows.stop)

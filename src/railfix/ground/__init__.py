@@ -1,7 +1,7 @@
 """Ground side: reference triangle, control centre, intervals and routes of trains, and redundant links.
 
-This module exports the parts without input or output: verdicts of the triangle and the monitor that acts on them,
-states of trains, intervals, routes and points, supervision by the centre, and supervision on board. The running centre
+This module exports the parts that do no input or output: the triangle's verdicts, the monitor that acts on the
+verdicts, states of trains, intervals, routes, points, and supervision in the centre and on board. The running centre
 (`railfix.ground.control`, `railfix.ground.serve`), its store, page and links need the extra ``railfix[ground]`` and are
 imported from their modules.
 """

@@ -23,7 +23,7 @@ GradientPart = tuple[Chainage, Annotated[int, Field(ge=-1000, le=1000)]]
 
 
 class Authority(Message):
-    """Movement authority, sent after each report of the train, when the train is stopped, and at least every second."""
+    """Movement authority, sent at least every second, after each report, and when the train's stop begins or ends."""
 
     kind: ClassVar[int] = 1
     train: Annotated[int, Field(ge=0, lt=1 << 32)]

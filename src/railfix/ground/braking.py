@@ -24,17 +24,16 @@ class BrakeLimits(Settings):
     """Brakes of a train, and the delays before the brakes act."""
 
     braking_mps2: float = Field(default=0.5, gt=0)  #: Deceleration of the braked train on level track.
-    #: Fraction of `braking_mps2` that braking curves assume.
-    safety: float = Field(default=0.9, gt=0, le=1)
-    least_mps2: float = Field(default=0.05, gt=0)  #: Lower limit of the deceleration assumed on downhill gradients.
+    safety: float = Field(default=0.9, gt=0, le=1)  #: Fraction of `braking_mps2` that braking curves assume.
+    least_mps2: float = Field(default=0.05, gt=0)  #: The deceleration assumed on downhill gradients is at least this.
     build_up_s: float = Field(default=2.0, ge=0)  #: Time from the intervention until the brakes act.
-    #: Time from the intervention until traction is cut off, at most `build_up_s`.
+    #: Time from the intervention until traction is cut off, or `build_up_s` if that is shorter.
     cut_s: float = Field(default=0.5, ge=0)
     traction_mps2: float = Field(default=0.5, ge=0)  #: Acceleration until traction is cut off.
     warning_s: float = Field(default=1.0, ge=0)  #: Time from the warning to the intervention.
     #: Driver's reaction time: time from exceeding the permitted speed to the intervention.
     reaction_s: float = Field(default=3.0, ge=0)
-    over_mps: float = Field(default=1.5, ge=0)  #: Excess over a restricted speed at which the intervention begins.
+    over_mps: float = Field(default=1.5, ge=0)  #: Excess over a speed limit at which the intervention begins.
 
 
 class Target(NamedTuple):
@@ -102,7 +101,7 @@ def _after_build_up(at_m: float, speed_mps: float, brakes: BrakeLimits) -> tuple
 
 
 def intervention_mps(at_m: float, target: Target, steps: Steps, brakes: BrakeLimits, *, before_s: float = 0.0) -> float:
-    """Return the highest speed at which an intervention `before_s` later is in time for the target [m/s].
+    """Return the highest speed at which the target is met if the intervention begins after `before_s` [m/s].
 
     At this speed, the train is on the curve of `braking_speed` when the brakes act. Between two changes of gradient,
     the position at which the brakes act is linear in the train's speed, and `braking_speed` is linear in this position.

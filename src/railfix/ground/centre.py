@@ -70,7 +70,7 @@ class ReferenceCurve:
         )
 
     def running_m(self, from_m: float, elapsed_s: float) -> float:
-        """Return the position of a train `elapsed_s` after it was at `from_m`, at most the next station [m]."""
+        """Return the position [m] of a train `elapsed_s` after it was at `from_m`; it stops at the next station."""
         at = np.interp(self.direction * from_m, self.direction * self.chainage_m, self.running_s)
         place = float(np.interp(at + max(elapsed_s, 0.0), self.running_s, self.chainage_m))
         ahead = self.direction * (self.stations_m - from_m)
@@ -89,7 +89,7 @@ class ReferenceCurve:
 
         Stations are numbered in running direction.
 
-        In P5 3.1, a train reports the station if it is at a station, otherwise the section and the progress.
+        In P5 3.1, a train at a station reports the station, and other trains report their section and progress.
         """
         along = self.direction * self.stations_m
         section = int(np.clip(np.searchsorted(along, self.direction * chainage_m, side="right") - 1, 0, len(along) - 2))
@@ -117,12 +117,13 @@ class CentreLimits(Settings):
     lost_s: float = Field(default=3.0, gt=0)
     error_s: float = Field(default=120.0, gt=0)  #: Time without an accepted report after which a train is in error.
     age_s: float = Field(default=5.0, gt=0)  #: Largest age of a position when it is sent; older positions are rejected.
-    #: Largest lag of a train's clock behind the times of the train's positions. Because this lag may vary, the time
-    #: between two positions is assumed to be longer by this value.
+    #: A position is rejected if its time is ahead of the train's own clock by more than this. As this lead may vary,
+    #: the centre adds this value to the time between two positions when it checks a train's distance.
     clock_s: float = Field(default=1.0, ge=0)
-    #: Largest accepted lead of a sequence number over the newest number, immediately after the newest number arrived.
+    #: A report is rejected if its sequence number exceeds the newest number by more than `jump`, plus `rate` for each
+    #: second since the newest number arrived.
     jump: int = Field(default=1000, ge=1)
-    #: Increase of `jump` per second since the newest number arrived.
+    #: Highest assumed rate at which a train numbers its reports [1/s]; used with `jump`.
     rate: float = Field(default=20.0, gt=0)
 
     @model_validator(mode="after")
@@ -147,7 +148,7 @@ class TrainRecord:
     heard_s: float = 0.0  #: Time on the centre's clock (monotonic) when `message` arrived [s].
     measured_s: float = 0.0  #: Time on the centre's clock for which the position of `message` is valid [s].
     shown_m: float | None = None  #: Displayed position of the front end [m].
-    #: Jump of the displayed position when reports last ended simulated running, positive in running direction [m].
+    #: Latest jump of the displayed position from simulated to reported, positive in running direction [m].
     jump_m: float | None = None
 
 
@@ -162,7 +163,7 @@ class Rejection(Enum):
     NO_PLACE = "without a position"
     NO_FACING = "the direction of the front end is unknown"
     NO_FRONT_END = "the position of the front end is unknown"
-    TOO_OLD = "position too old when it was sent, or later than the train's clock; set the train's clock"
+    TOO_OLD = "position too old when it was sent, or its time is ahead of the train's clock; set the train's clock"
 
 
 #: Number of earlier sessions of the on-board unit whose identifiers are stored.
@@ -172,10 +173,10 @@ _RETIRED = 16
 def report_received(
     record: TrainRecord, message: TrainMessage, now_s: float, *, limits: CentreLimits
 ) -> tuple[TrainRecord, Rejection | None]:
-    """Return the record after a report, and the reason if the report is rejected, otherwise None.
+    """Return the record after a report, and the reason for rejecting the report, None if it is accepted.
 
     The time of the measurement is the time of arrival minus the age of the position. The age is computed with the
-    train's own clock, so that the clocks of train and centre need not agree. The unknown delay of the link is
+    train's own clock, so that the clocks of train and centre need not be synchronised. The unknown delay of the link is
     neglected.
     """
     if message.train != record.train:

@@ -1,8 +1,8 @@
-"""Changes of trains by order: correct an interval; enter, remove, join and divide trains.
+"""Changes ordered by a person: correct a train's interval; enter, remove, join and divide trains.
 
-Reports cannot show these changes, so that a person who has observed a change enters it. Each change leaves the changed
-trains stopped, to be released one by one (`railfix.ground.stops.release_train`), and frees no track that a train may
-still occupy.
+Reports cannot show these changes; therefore, a person who has observed a change enters it. Each change leaves the
+changed trains stopped, to be released one by one (`railfix.ground.stops.release_train`), and frees no track that a
+train may still occupy.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ def _placed(
     if direction not in (-1, 1) or track not in (1, 2):
         return "direction must be -1 or 1, and track 1 or 2"
     if direction * (front_m - rear_m) < train.length_m:
-        return f"from rear_m to front_m in running direction there is no room for a train of {train.length_m:g} m"
+        return f"there is no room for a train of {train.length_m:g} m from rear_m to front_m in running direction"
     if low < layout.stations[0].begin_m or high > layout.stations[-1].end_m:
         return "the interval reaches beyond the line"
     stations = layout.stations_between(low, high)
     tracks = dict.fromkeys(stations, track)
-    # the route of a train between two stations ends in the station behind the train
+    # between two stations, a train's route ends in the station that the train has left
     behind = [k for k, s in enumerate(layout.stations) if direction * (s.begin_m - front_m) < 0.0]
     station = max(behind) if direction > 0 else min(k for k, s in enumerate(layout.stations) if s.end_m > front_m)
     if station not in tracks:
@@ -59,9 +59,9 @@ def correct_interval(
 ) -> Changed:
     """Set the interval of a stopped train; return the new state, and the reason if the order is refused.
 
-    The train's route and authority end, and the train's locks on points are removed. Therefore, the train must have
-    reported that it obeys an order to brake that no authority in transit can end, or all authorities must have lapsed
-    on board (`lapsed`).
+    The train's route and authority end, and the train's locks on points are removed. Therefore, either all authorities
+    must have lapsed on board (`lapsed`), or the train must have reported that it obeys an order to brake, and no
+    authority in transit can end this order.
     """
     known = state.trains.get(train)
     if known is None:
@@ -78,7 +78,7 @@ def correct_interval(
 
 
 def _may_run(known: TrainInterval, *, lapsed: bool) -> str | None:
-    """Return the reason for a refusal if an authority in transit may still permit a train to run, otherwise None."""
+    """Return None if no authority in transit can permit a train to run, otherwise the reason for a refusal."""
     if known.runs_by is None or lapsed:
         return None
     return (
@@ -117,7 +117,7 @@ def enter_train(
 def _refused_overlap(
     state: Interlocking, train: TrainInterval, layout: Layout, points: Mapping[PointName, PointState]
 ) -> Changed:
-    """Add a train unless another train's interval overlaps; return the new state, and the reason for a refusal."""
+    """Add a train unless its interval overlaps another interval; return the new state, and the reason for a refusal."""
     pieces = pieces_of(train, layout)
     for other in state.trains.values():
         if other.train != train.train and overlap(pieces, pieces_of(other, layout)):
@@ -146,33 +146,32 @@ def remove_train(state: Interlocking, train: int, layout: Layout, *, lapsed: boo
     if known is None:
         return state, f"no such train: {train}"
     if known.stop is None or not known.standstill:
-        return state, f"train {train} is not stopped, or not at rest"
+        return state, f"train {train} has not been ordered to stop, or is not at rest"
     if (reason := _may_run(known, lapsed=lapsed)) is not None:
         return state, reason
     pieces = pieces_of(known, layout)
     trains = {number: other for number, other in state.trains.items() if number != train}
     state = replace(state, trains=trains, points=without_locks(state.points, train))
     for name, own in layout.sections.items():
-        # the section of a whole station is barred only if the train is on its points; the tracks are sections of their
-        # own
+        # the section of a whole station is closed only if the train is on the points; each track is another section
         if overlap(own if len(own) == 1 else [piece for piece in own if piece[0] == 0], pieces):
             state = close_section(state, name, layout, f"{name} is {OCCUPIED}", kind=OCCUPIED)
     return state, None
 
 
 def join_trains(state: Interlocking, lead: int, other: int, layout: Layout) -> Changed:
-    """Join train `other` to train `lead` ahead of it; return the new state, and the reason if the order is refused.
+    """Join train `other` to train `lead`, which is ahead; return the new state, and the reason if the order is refused.
 
     The joined train has the number `lead`, the sum of both lengths, and an interval that includes both intervals.
     """
     first, second = state.trains.get(lead), state.trains.get(other)
     if first is None or second is None or lead == other:
-        return state, "two trains of the line were expected"
+        return state, "two different trains of the line were expected"
     if not all(train.stop is not None and train.standstill for train in (first, second)):
-        return state, "one of the trains is not stopped, or not at rest"
+        return state, "one of the trains has not been ordered to stop, or is not at rest"
     d = first.direction
     if second.direction != d or d * (first.front_m - second.front_m) < 0.0:
-        return state, f"train {other} is not behind train {lead} with the same direction"
+        return state, f"train {other} is not behind train {lead}, or has another direction"
     if d * (first.rear_m - second.interval_m[1]) > APART_M:
         return state, f"the intervals of the trains are more than {APART_M:g} m apart"
     if any(first.tracks[k] != track for k, track in second.tracks.items() if k in first.tracks):
@@ -204,7 +203,7 @@ def divide_train(state: Interlocking, train: int, other: int, *, length_m: float
     if other in state.trains or not 0 < other < 1 << 32:
         return state, f"{other} is not a valid number for the other part"
     if known.stop is None or not known.standstill:
-        return state, f"train {train} is not stopped, or not at rest"
+        return state, f"train {train} has not been ordered to stop, or is not at rest"
     if not 0.0 < length_m < known.length_m:
         return state, f"a length between 0 and {known.length_m:g} m was expected"
     if known.reported_m is None or known.outside_m() > 0.0:

@@ -1,4 +1,4 @@
-"""Control centre in operation: supervision, store, monitor of satellite positioning, log, and values on the page.
+"""Running control centre: supervision, store, monitor of satellite positioning, log, and values on the web page.
 
 Authorities, which also acknowledge reports, are committed to the store before they are sent. A centre that is killed at
 any moment therefore restarts with every authority that its trains may have received.
@@ -80,7 +80,7 @@ class ControlCentre:
     reports: int = 0
     rejected: Counter[str] = field(default_factory=Counter)  #: Number of rejected reports, by reason.
     stop_s: float | None = None
-    stops: dict[int, StopOrder] = field(default_factory=dict)  #: Orders to stop, by train.
+    stops: dict[int, StopOrder] = field(default_factory=dict)  #: Newest order to stop of each train that is stopped.
     #: Commits to the store; in a running centre, they are carried out in a thread.
     commits: Commits = field(default_factory=Commits)
     #: Function that requests the detection of a set of points; `Supervision.set_detected` processes the answer.
@@ -100,11 +100,11 @@ class ControlCentre:
 
     @classmethod
     def restore(cls, supervision: Supervision, store: Store, *, judged: bool, **rest: Any) -> ControlCentre:
-        """Return the centre with the state that an earlier process stored, or at the first start with the given state.
+        """Return the centre with the state stored by an earlier process; at the first start, with the given state.
 
-        After a restart, trains are unknown until they report, and the detection of all points is requested. If a
-        triangle monitors satellite positioning (`judged`), all trains are stopped at the first start until the stop is
-        released by hand. A stop from before a restart remains.
+        After a restart, trains are unknown until they report, and the detection of all points is requested. With a
+        triangle (`judged`), all trains are stopped from the first start until a release by hand. A stop from before a
+        restart remains.
         """
         texts, monitor = store.documents(HEAD), MonitorState() if judged else None
         asked: tuple[PointName, ...] = ()
@@ -153,7 +153,7 @@ class ControlCentre:
         reason = self.supervision.report(message, self.clock())
         after = self.supervision.records.get(number, before)
         if after.session != before.session and before.sequence >= 0:
-            self.log(f"train {number}: started again on board", train=number)
+            self.log(f"train {number}: on-board unit restarted", train=number)
         if after.rejected != before.rejected:
             word = "reports are accepted again" if after.rejected is None else f"report rejected: {after.rejected}"
             self.log(f"train {number}: {word}", train=number)
@@ -172,7 +172,7 @@ class ControlCentre:
             self.log(f"train {number}: first report", train=number)
 
     def _note_report(self, was: TrainInterval, known: TrainInterval, message: TrainMessage) -> None:
-        """Count and log contradictions between a report and the record, and log whether a train returns its route."""
+        """Count and log contradictions between report and record; log whether a train gives back or keeps its route."""
         number = known.train
         if known.contradiction is not None:
             self.rejected["contradicts the record of the train"] += 1
@@ -182,7 +182,7 @@ class ControlCentre:
         elif known.stop is not None and was.stop is None:
             self.log(f"train {number}: stopped, {known.stop}", train=number)
         elif known.direction != message.facing:
-            self.rejected["change of ends outside its station, or of an incomplete train"] += 1
+            self.rejected["change of ends outside the station, or by a train that is not complete"] += 1
         if was.asked_m is not None and known.asked_m is None:
             what = "has returned its route" if known.held else "keeps its route"
             self.log(f"train {number}: {what}", train=number)
@@ -201,7 +201,7 @@ class ControlCentre:
         """Alarms about reports awaited after a start of the centre, and about interference that trains suspect."""
         awaited = self.supervision.awaited_text
         waits = (
-            [f"nothing is granted until these trains report, or confirm-start is ordered twice for them: {awaited}"]
+            [f"no authorities are extended until these trains report, or confirm-start is ordered twice: {awaited}"]
             if awaited
             else []
         )
@@ -212,13 +212,12 @@ class ControlCentre:
     def judge(self, verdict: TriangleVerdict, receiver: int = -1, *, age_s: float = 0.0) -> None:
         """Process a verdict on satellite positioning from fixes of age `age_s`.
 
-        A verdict is ignored if its fixes are older than `MonitorLimits.late_s`, or farther in the future than this
-        time.
+        A verdict is ignored if the time of its fixes is more than `MonitorLimits.late_s` before or after the present.
 
         Each step uses the most severe verdict since the previous step.
         """
         if abs(age_s) > self.times.late_s:
-            self.rejected["fixes of the triangle with a wrong age"] += 1
+            self.rejected["fixes of the triangle too old, or in the future"] += 1
             return
         if self._verdict is None or _severity(verdict) >= _severity(self._verdict[0]):
             self._verdict = verdict, receiver
@@ -404,7 +403,7 @@ class ControlCentre:
 
 
 def list_orders(centre: ControlCentre) -> dict[str, Order]:
-    """Return the functions of the page's orders, by name of the order."""
+    """Return the function that carries out each order of the page, by name of the order."""
     desk = OrderDesk(
         supervision=centre.supervision, clock=centre.clock, log=centre.log, release=centre.release, stop=centre.stop
     )

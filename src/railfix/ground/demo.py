@@ -122,7 +122,7 @@ class _Back(asyncio.DatagramProtocol):
 PLAN_M: Floats = np.array([[0.0, 0.0], [800.0, 100.0], [300.0, 700.0]])
 #: Elevations of the nine simulated satellites [deg].
 ELEVATION_DEG = np.array([75.0, 50.0, 48.0, 35.0, 33.0, 25.0, 22.0, 18.0, 60.0])
-#: Azimuths of the satellites, clockwise from north [deg].
+#: Azimuths of the nine simulated satellites, clockwise from north [deg].
 AZIMUTH_DEG = np.array([20.0, 80.0, 150.0, 215.0, 290.0, 340.0, 110.0, 250.0, 310.0])
 TIME = np.datetime64("2024-03-05T00:00:00", "ns")
 
@@ -135,10 +135,10 @@ def points_ecef_m() -> Floats:
 def draw_fixes(
     rng: np.random.Generator, *, epochs: int = 60, common_m: Floats | None = None, moved_m: Floats | None = None
 ) -> StationFixes:
-    """Return fixes, one per second, from simulated ranges of fixed satellites.
+    """Return fixes, one per second, from simulated ranges to satellites that do not move.
 
     `common_m`, shape (T, 9), are satellite errors common to the receivers. `moved_m`, shape (T, 3, 2), are the east and
-    north displacements of each receiver's fix; with NaN, the receiver has no fix, and its C/N0 is marked as fallen.
+    north displacements of each receiver's fix; NaN means that the receiver has no fix, and that its C/N0 has fallen.
     """
     points, axes = points_ecef_m(), enu_axes(35.7, 139.7)
     el, az = np.radians(ELEVATION_DEG), np.radians(AZIMUTH_DEG)
@@ -169,10 +169,10 @@ def draw_fixes(
 HOSTS: Final[dict[LinkName, str]] = {"A": "127.0.1.1", "B": "127.0.2.1"}
 #: Start and end of the outage of bearer A, in simulated time [s].
 OUTAGE_A_S: Final = (40.0, 80.0)
-#: Start and end of the outage of both bearers of train 1 [s].
+#: Start and end of the outage of both bearers of train 1, in simulated time [s].
 OUTAGE_BOTH_S: Final = (106.0, 118.0)
-FAULT_S: Final = 130.0  #: Time at which the satellite fault begins [s].
-END_S: Final = 170.0  #: Time at which the run ends [s].
+FAULT_S: Final = 130.0  #: Simulated time at which the satellite fault begins [s].
+END_S: Final = 170.0  #: Simulated time at which the demonstration ends [s].
 _TIME_NS: Final = 1_400_000_000_000_000_000
 
 
@@ -183,7 +183,7 @@ class LinkedTraffic(Traffic):
     links: dict[int, TrainLinks]
     control: ControlCentre
     verdicts: list[tuple[TriangleVerdict, int]]  #: Verdicts of the triangle, one per second.
-    rest_s: float | None = None  #: Time at which all trains were at rest after a stop [s]; None before.
+    rest_s: float | None = None  #: Time at which all trains were at rest after a stop [s]; None before that.
 
     def step(self) -> None:
         """Run a step, and record the time at which all trains are at rest after a stop."""
@@ -256,9 +256,9 @@ async def run_demo(
     """Run the demonstration and return its results by name.
 
     `speed` is in simulated seconds per second. The page is served on the loopback address at `port` (0 selects a free
-    port), and `password` permits the release of a stop. `announce` is called with the page's address, and `keep` is
-    awaited with this address before the page closes. `picture` is the path at which the picture of response rates along
-    the line is written.
+    port), and `password` permits the release of a stop. `announce` and, before the page closes, the coroutine function
+    `keep` are called with the page's address. `picture` is the path at which the picture of response rates along the
+    line is written.
     """
     async with contextlib.AsyncExitStack() as held:
         folder, done = Path(held.enter_context(tempfile.TemporaryDirectory())), False
@@ -295,7 +295,7 @@ async def run_demo(
                     {"A": f"127.0.1.{10 + number}", "B": f"127.0.2.{10 + number}"},
                 ),
                 received=lambda payload: traffic.authority(Authority.decode(payload)),
-                limits=LinkLimits(idle_s=10.0),  # the outages are short in real time
+                limits=LinkLimits(idle_s=10.0),  # longer than the outages in real time
             )
             await links.start()
             held.push_async_callback(links.stop)
@@ -343,7 +343,7 @@ async def _run(traffic: LinkedTraffic, relays: dict[tuple[int, LinkName], Relay]
             alone = OUTAGE_A_S[0] <= now < OUTAGE_A_S[1] and bearer == "A"
             relay.disturbance.up = not (alone or (both and number == 1))
         traffic.step()
-        # Time lost on a busy machine is not made up, because simulated time would then run too fast for the links.
+        # Time lost on a busy machine is not caught up, because the links cannot follow a faster simulated time.
         start = max(start, loop.time() - traffic.now_s / speed)
         await asyncio.sleep(start + traffic.now_s / speed - loop.time())
 
@@ -360,7 +360,7 @@ def _figures(traffic: LinkedTraffic, trains: dict[int, TrainLinks], centre: Cent
             for n, links in trains.items()
             for bearer, meter in links.meters.items()
         },
-        "times shown by simulated running": sum(line.endswith(": simulated") for line in control.lines),
+        "times that a position was simulated": sum(line.endswith(": simulated") for line in control.lines),
         "satellite fault begins [s]": FAULT_S,
         "cause": None if monitor is None or monitor.cause is None else monitor.cause.name.lower(),
         "suspended and stop ordered [s]": control.stop_s,

@@ -1,7 +1,7 @@
 """Orders given on the page, and their confirmation by a second order.
 
 For each order, the log gets a line with the author and the outcome. Orders based on an observation that no report
-confirms are given twice: by two people, or by one person after a minimum time.
+confirms must be given twice: by two people, or by one person after a minimum time.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from railfix.ground.web import Order
 
 #: Shortest and longest time after which the same person may confirm an order [s]; another person may confirm at once.
 AGAIN_S: Final = 3.0, 60.0
-#: Longest accepted reason [characters].
+#: Longest accepted text of the reason for an order [characters].
 LONGEST_REASON: Final = 200
 Values = dict[str, Any]
 
@@ -80,7 +80,7 @@ class OrderDesk:
         )
 
     def asked_s(self, name: str, values: Values) -> float:
-        """Return the time at which an order was given that awaits confirmation, or else the present time [s]."""
+        """Return the time at which an equal order that awaits confirmation was given, or the present time [s]."""
         key = f"{name} {json.dumps(values, sort_keys=True)}"
         return self._asked.get(key, (self.clock(), ""))[0]
 
@@ -103,12 +103,10 @@ class OrderDesk:
     def twice(
         self, name: str, change: Callable[[Values], tuple[Interlocking, str | None]], what: str, values: Values, by: str
     ) -> str | None:
-        """Change trains when the order is given a second time; both orders must contain the same reason."""
+        """Carry out a change of trains when it is ordered again; both orders must contain the same reason."""
         reason = values.get("reason")
         if not isinstance(reason, str) or not 0 < len(reason.strip()) <= LONGEST_REASON:
-            return (
-                f"reason: one to {LONGEST_REASON} characters that state the observer and the observation were expected"
-            )
+            return f"reason: one to {LONGEST_REASON} characters on who observed what were expected"
         since_s = self.asked_s(name, values)
         before = self.supervision.state
         state, refused = change(values)
@@ -120,7 +118,7 @@ class OrderDesk:
         return refused
 
     def _moved_meanwhile(self, before: Interlocking, after: Interlocking, since_s: float) -> str | None:
-        """Return a message if a train has reported a position outside its new interval since the first order."""
+        """Return a message if, since the first order, a train has reported a position outside its new interval."""
         for number, train in after.trains.items():
             known, record = before.trains.get(number), self.supervision.records.get(number)
             if known is None or known is train or known.reported_m is None or record is None:
@@ -133,7 +131,7 @@ class OrderDesk:
         return None
 
     def change(self, values: Values, *, of: str) -> tuple[Interlocking, str | None]:
-        """Return the state after the change that `of` names, and the reason if the change is refused."""
+        """Carry out the change named `of`; return the new state, and the reason if the change is refused."""
         state, layout = self.supervision.state, self.supervision.layout
         train = number_of(values, "train")
         if isinstance(train, str):
@@ -165,7 +163,7 @@ class OrderDesk:
         return divide_train(state, train, other, length_m=length[0])
 
     def confirm_start(self, values: Values, by: str) -> str | None:
-        """Stop waiting for trains that have not reported since the start of the centre, when ordered a second time."""
+        """On the second order, stop waiting for trains that have not reported since the start of the centre."""
         if not self.supervision.awaited:
             return "every train has reported since the start"
         what = f"the database is not an older copy, and these trains do not report: {self.supervision.awaited_text}"
@@ -174,7 +172,7 @@ class OrderDesk:
         return reason
 
     def section(self, values: Values, by: str, *, of: str) -> str | None:
-        """Bar a section, or remove a bar; an occupied section is freed only when the order is given a second time."""
+        """Close, open, occupy or free a section; a section is freed only when the order is given a second time."""
         supervision, name = self.supervision, str(values.get("section", ""))
         layout, state = supervision.layout, supervision.state
         if name not in layout.sections:

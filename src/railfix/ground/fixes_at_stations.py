@@ -34,9 +34,9 @@ from railfix.ranges.channels import PLAUSIBLE_CODE_M, clock_groups
 from railfix.ranges.range_sigma import code_sigma_m
 from railfix.run.processor_setup import parse_position
 
-#: Minimum drop of a receiver's mean C/N0 below the median over the preceding epochs that counts as a fall [dB-Hz].
+#: The C/N0 of a receiver has fallen if its mean is more than this below the median over preceding epochs [dB-Hz].
 FALLEN_DBHZ = 6.0
-#: Number of preceding epochs over which the median of the mean C/N0 is computed.
+#: Largest number of preceding epochs over which the median of the mean C/N0 is computed.
 USUAL_EPOCHS: Final = 600
 #: Time tags of different receivers that round to the same multiple of this interval belong to one epoch.
 SAME_EPOCH = np.timedelta64(100, "ms")
@@ -54,18 +54,18 @@ class StationFixes(FrozenArrays):
     #: East and north coordinates of the fixes relative to the first known point [m], NaN if too few satellites are
     #: common to the receivers; shape (T, N, 2).
     fixes_m: Floats
-    n_satellites: Integers  #: Number of common satellites, 0 if unknown; shape (T,).
+    n_satellites: Integers  #: Number of satellites common to all receivers, 0 if unknown; shape (T,).
     cn0_fallen: Masks  #: Whether the mean C/N0 of a receiver has fallen; shape (T, N).
 
 
 def station_fixes(logs: list[Observations], points_ecef_m: Floats, navigation: Navigation) -> StationFixes:
-    """Compute the fixes of a triangle's receivers with the default settings of a run.
+    """Compute the fixes of a triangle's receivers with the default settings of `railfix run`.
 
     Parameters
     ----------
     logs : list of Observations, length N
     points_ecef_m : ndarray, shape (N, 3) [m]
-        Known points of the antennas.
+        Known positions of the antennas.
     navigation : Navigation
 
     Raises
@@ -80,7 +80,7 @@ def station_fixes(logs: list[Observations], points_ecef_m: Floats, navigation: N
     common = [name for name in names[0] if all(name in other for other in names[1:])]
     common = list({satellite: (satellite, signal) for satellite, signal in reversed(common)}.values())[::-1]
     if not common:
-        raise MismatchError("no satellite is in all logs on one signal; record the same signals with all receivers")
+        raise MismatchError("no satellite has the same signal in all logs; record the same signals with all receivers")
     time, rows_of = _common_epochs([log.time for log in logs])
     tags = np.stack([log.time[rows] for log, rows in zip(logs, rows_of, strict=True)])
     satellite, signal = (np.array(column) for column in zip(*common, strict=True))
@@ -116,7 +116,7 @@ def station_fixes(logs: list[Observations], points_ecef_m: Floats, navigation: N
 
 
 def fixes_of_ranges(time: Datetimes, ranges: list[Ranges], points_ecef_m: Floats, *, cn0_fallen: Masks) -> StationFixes:
-    """Compute single point positions from corrected ranges of the same satellites, as in a run.
+    """Compute single point positions from corrected ranges to the same satellites.
 
     `ranges` contains the ranges of each of N receivers at the T times of `time`. The shape of `points_ecef_m` is (N,
     3), and the shape of `cn0_fallen` is (T, N).
@@ -136,7 +136,7 @@ def fixes_of_ranges(time: Datetimes, ranges: list[Ranges], points_ecef_m: Floats
 
 
 def read_fixes(logs: Sequence[str], nav: Sequence[Path], points: Sequence[str], *, computed: bool) -> StationFixes:
-    """Read the positions of three receivers if `computed`, otherwise compute them from the observations.
+    """Return the fixes of three receivers: positions in the logs if `computed`, else computed from observations.
 
     `points` are the known points as strings, one per log; without `points`, the positions in the headers of the logs
     are used. Raise SettingsError if navigation files or points are required but missing, or if navigation files are
@@ -146,7 +146,7 @@ def read_fixes(logs: Sequence[str], nav: Sequence[Path], points: Sequence[str], 
     known = np.array([parse_position(text, "--point") for text in points])
     if computed:
         if nav:
-            raise SettingsError("--nav cannot be used with --fixes: positions are not computed again")
+            raise SettingsError("--nav cannot be used with --fixes: the positions in the logs are used as they are")
         if not len(known):
             raise SettingsError(
                 "--point is missing: logs of positions contain no known points; give it for each receiver"
@@ -164,7 +164,7 @@ def read_fixes(logs: Sequence[str], nav: Sequence[Path], points: Sequence[str], 
 
 
 def fixes_of_positions(logs: Sequence[PositionLog], points_ecef_m: Floats) -> StationFixes:
-    """Return fixes that other programs or services have computed (RTK, PPP-RTK), one log per receiver.
+    """Return the fixes in logs of other programs or services (RTK, PPP-RTK), with one log per receiver.
 
     `n_satellites` is 0, because it is unknown whether the receivers used the same satellites. Raise MismatchError if
     the logs have no epoch in common.
@@ -225,7 +225,7 @@ def fallen_cn0(level_dbhz: Floats, earlier_dbhz: Floats) -> Masks:
     return np.asarray(level_dbhz < usual[len(earlier_dbhz) :] - FALLEN_DBHZ)
 
 
-#: Largest number of epochs that wait until every receiver has sent them.
+#: Largest number of epochs that wait until every receiver has sent them; the oldest is then dropped.
 _LONGEST_QUEUE: Final = 1000
 
 
@@ -257,7 +257,7 @@ class StationStreams:
         if tag_ns % 1_000_000_000 or tag <= self._done:
             return None
         for later, epochs in list(self._waiting.items()):
-            # drop the receiver's future epochs: wrong future tags would displace the other receivers' epochs
+            # drop the receiver's later epochs; if their tags are wrong, they crowd other epochs out of the queue
             if later > tag and epochs.pop(receiver, None) is not None and not epochs:
                 del self._waiting[later]
         together = self._waiting.setdefault(tag, {})
@@ -288,7 +288,7 @@ class StationStreams:
 async def stream_fixes(
     sources: Sequence[str], points_ecef_m: Floats, *, navigation: Navigation | None = None
 ) -> AsyncIterator[StationFixes]:
-    """Yield the fixes of each epoch until every source has ended.
+    """Yield the fixes epoch by epoch; end when all sources have ended.
 
     Sources are written as for ``railfix live`` (``tcp://HOST:PORT``, ``ntrip://``, ``serial:``, receiver files and
     RINEX files). Raise InputFileError if a source cannot be opened, or fails and cannot be opened again.

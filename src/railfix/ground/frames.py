@@ -26,7 +26,7 @@ _CHECK: Final = struct.Struct("!I")
 LONGEST_PAYLOAD: Final = 1100
 #: Number of recent sequence numbers that are stored to detect repeated frames.
 REMEMBERED: Final = 4096
-#: Number of earlier sessions of the sender whose identifiers are stored.
+#: Number of earlier sessions of the sender whose identifiers are stored, to reject late frames.
 RETIRED: Final = 64
 
 
@@ -72,7 +72,7 @@ class Frame:
     def encode(self) -> bytes:
         """Return the bytes of the frame, followed by their CRC."""
         if len(self.payload) > LONGEST_PAYLOAD:
-            raise ValueError(f"a payload of {len(self.payload)} bytes; at most {LONGEST_PAYLOAD} fit a frame")
+            raise ValueError(f"the payload has {len(self.payload)} bytes; a frame holds at most {LONGEST_PAYLOAD}")
         data = _HEAD.pack(self.kind, self.sender, self.session, self.sequence, self.time_ns) + self.payload
         return data + _CHECK.pack(zlib.crc32(data))
 
@@ -105,9 +105,10 @@ class ReceiverLimits(Settings):
     delay_s: float = Field(default=5.0, gt=0)  #: Largest accepted delay in excess of the shortest observed delay.
     #: Largest relative drift between the clocks of both ends; the stored shortest delay grows at this rate.
     drift: float = Field(default=1e-4, ge=0)
-    #: Largest accepted lead of a sequence number over the newest number, immediately after the newest number arrived.
+    #: A frame is rejected if its sequence number exceeds the newest number by more than `jump`, plus `rate` for each
+    #: second since the newest number arrived.
     jump: int = Field(default=1000, ge=1)
-    #: Increase of `jump` per second since the newest number arrived.
+    #: Highest assumed rate at which the sender numbers its frames [1/s]; used with `jump`.
     rate: float = Field(default=100.0, gt=0)
 
 
@@ -120,7 +121,7 @@ class _Seen:
     bits: int = 0
 
     def is_alone(self, sequence: int, now_ns: int, limits: ReceiverLimits) -> bool:
-        """Return whether a number exceeds the newest number by more than the sender can have counted meanwhile."""
+        """Return whether a number is above all numbers that the sender can have reached since the newest number."""
         most = limits.jump + limits.rate * (now_ns - self.at_ns) / 1e9
         return self.newest >= 0 and sequence > self.newest + most
 
@@ -211,7 +212,7 @@ class FrameReceiver:
         )
 
     def _late(self, frame: Frame, now_ns: int) -> bool:
-        """Return whether a frame's delay exceeds the shortest delay too much; the clocks need not agree."""
+        """Return whether a frame exceeds the shortest delay by over `delay_s`; clocks need not be synchronised."""
         took = now_ns - frame.time_ns
         if self._shortest_ns is None:
             self._shortest_ns = float(took)

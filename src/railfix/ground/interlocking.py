@@ -1,9 +1,9 @@
 """Authorities, routes and points of a single-track line with passing loops.
 
 A pure state machine. A train occupies the interval from its last safe rear end to the end of its authority. An
-authority is extended to a margin before the nearest of these limits: another train's interval, a section that is closed
-or occupied, points that are not both locked and detected for the train, or the end of the train's route. Authorities
-are shortened only by agreement with the train (`railfix.ground.stops`). Reports move the intervals
+authority is extended up to the nearest of these limits, less a margin: another train's interval, a section that is
+closed or occupied, points that are not both locked and detected for the train, or the end of the train's route.
+Authorities are shortened only by agreement with the train (`railfix.ground.stops`). Reports move the intervals
 (`railfix.ground.reports`). Shunting, overlaps behind signals, level crossings and degraded working by hand are not
 modelled.
 """
@@ -30,7 +30,7 @@ class NearbyTrains:
     def __init__(self, state: Interlocking, layout: Layout) -> None:
         self._layout = layout
         self._blocks: dict[int, set[int]] = defaultdict(set)
-        #: Record of each train at the last update, and the train's blocks.
+        #: Record and blocks of each train at the last update.
         self._located: dict[int, tuple[TrainInterval, range]] = {}
         self.update(state)
 
@@ -87,15 +87,15 @@ def stop_orders(state: Interlocking) -> dict[int, str]:
     by_high = sorted((high, low) for low, high, _ in by_low)
     free = [span for span in by_low if span[2] not in found]
     for number in list(found):
-        # Range that includes the nearest train on either side. Trains on other tracks of the stopped train's station,
-        # and of the station of a nearest train, overlap this range as well.
+        # Range that includes the nearest train on either side. The range also overlaps trains on other tracks of the
+        # stations in which the stopped train and its nearest trains are.
         low, high = state.trains[number].span_m
         if (k := bisect_left(by_low, (high,))) < len(by_low):
             high = by_low[bisect_right(by_low, (by_low[k][0], math.inf)) - 1][1]
         if k := bisect_right(by_high, (low, math.inf)):
             low = by_high[bisect_left(by_high, (by_high[k - 1][0],))][1]
         beside = [span for span in free if span[0] <= high and span[1] >= low]
-        found.update((span[2], f"train {number} is stopped next to it") for span in beside)
+        found.update((span[2], f"the neighbouring train {number} is stopped") for span in beside)
         free = [span for span in free if span not in beside] if beside else free
     return found
 
@@ -104,8 +104,8 @@ def points_reported(state: Interlocking, point: PointName, detected: int | None,
     """Return the state after points were reported as detected for track `detected`, or as undetected (None).
 
     Trains that lock the points are stopped if the detection of the points is lost. If points without detection are
-    detected again, but not in the commanded position, the trains over the points are stopped. Points that no train
-    locks remain in their detected position.
+    detected again, but not in the commanded position, trains on the points are stopped. Points that no train locks
+    remain in their detected position.
     """
     before = state.points[point]
     after = replace(before, detected=detected)
@@ -205,7 +205,7 @@ def _taken(state: Interlocking, here: TrainInterval, layout: Layout, nearby: Nea
 
 
 def barred(state: Interlocking, path: list[Piece], layout: Layout) -> tuple[str, str] | None:
-    """Return the name of a barred section that shares track with a path, and the kind of bar; None if there is none."""
+    """Return the name of a closed section that shares track with a path, and the reason; None if there is none."""
     for name, kind in sorted(state.bars):
         if any(shares(piece, mine) for piece in layout.sections[name] for mine in path):
             return name, kind
@@ -225,12 +225,12 @@ def comes_the_other_way(other: TrainInterval, direction: int, section: int, layo
 
 
 def is_free(state: Interlocking, point: PointName, layout: Layout, nearby: NearbyTrains) -> bool:
-    """Return whether points may be moved: not locked, and not in any interval or barred section."""
+    """Return whether points may be moved: not locked, and not in any interval or closed section."""
     return not (state.points[point].locked or under_interval(state, point, layout, nearby))
 
 
 def under_interval(state: Interlocking, point: PointName, layout: Layout, nearby: NearbyTrains) -> bool:
-    """Return whether any train's interval, or any barred section, includes a set of points."""
+    """Return whether any train's interval, or any closed section, includes a set of points."""
     zone: Piece = (0, *layout.zone_m(point))
     if barred(state, [zone], layout) is not None:
         return True
@@ -245,8 +245,8 @@ def due_commands(
 ) -> tuple[Interlocking, dict[PointName, int]]:
     """Return the state after all due commands to points, and the commanded track by set of points.
 
-    A command is due only if it is stored. Points get no command while their detection is awaited or an interval
-    includes them.
+    A command is due only after the commanded position is stored. Points get no command while their detection is awaited
+    or an interval includes them.
     """
     due = {
         name: point
@@ -260,7 +260,7 @@ def due_commands(
         if point.lies:
             points[name] = replace(point, commanded=True)
         elif not under_interval(state, name, layout, nearby):
-            points[name] = replace(point, commanded=True, detected=None)  # undetected until the field answers
+            points[name] = replace(point, commanded=True, detected=None)  # undetected until the trackside answers
             given[name] = point.wanted
     return replace(state, points=points), given
 
@@ -338,7 +338,7 @@ def _limit_m(
 
 
 def bars_ahead(state: Interlocking, layout: Layout) -> list[Piece]:
-    """Return the pieces of track of all barred sections."""
+    """Return the pieces of track of all closed sections."""
     return [piece for name, _ in state.bars for piece in layout.sections[name]]
 
 

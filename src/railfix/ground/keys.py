@@ -28,10 +28,10 @@ _PEM: Final = serialization.Encoding.PEM
 
 
 def check_keys(folder: Path, name: str) -> None:
-    """Raise InputFileError if a key or certificate file that `name` (an end of the links) requires is missing."""
+    """Raise InputFileError if a key or certificate file of `name` (``centre`` or ``train-N``) is missing."""
     for file in ("authority.pem", f"{name}.pem", f"{name}.key"):
         if not (folder / file).is_file():
-            raise InputFileError(folder / file, "does not exist; create it by railfix ground keys")
+            raise InputFileError(folder / file, "does not exist; create it with railfix ground keys")
 
 
 class Peer(NamedTuple):
@@ -70,7 +70,7 @@ class Revoked(NamedTuple):
 
 
 def read_revoked(folder: Path) -> Revoked:
-    """Return the revoked certificates listed as words in ``revoked.txt``; without this file, there are none.
+    """Return the revoked certificates listed in ``revoked.txt``, separated by blanks; without this file, none.
 
     A name (``train-7``) revokes all certificates of that name, including later certificates. A serial number
     (``0x5a1f...``, as printed by `railfix ground keys`) revokes one certificate, so that a train whose key was lost can
@@ -89,11 +89,11 @@ def read_revoked(folder: Path) -> Revoked:
 
 def ending_sentence(name: str, ends: datetime) -> str:
     """Return a sentence that states when a certificate expires, and how to renew it."""
-    return f"the certificate {name} ends on {ends.date().isoformat()}; renew it (railfix ground keys --renew)"
+    return f"the certificate {name} expires on {ends.date().isoformat()}; renew it (railfix ground keys --renew)"
 
 
 def list_ending(folder: Path, name: str, *, now: datetime | None = None) -> list[str]:
-    """Return a sentence for each certificate (of `name`, of the authority) that expires within `WARNING_DAYS`."""
+    """Return a sentence for each certificate of `name` or the authority that expires within `WARNING_DAYS`."""
     limit = (now or datetime.now(UTC)) + timedelta(days=WARNING_DAYS)
     found = []
     for file in (f"{name}.pem", "authority.pem"):
@@ -157,7 +157,7 @@ def _read_authority(folder: Path) -> tuple[ec.EllipticCurvePrivateKey, x509.Cert
         certificates = x509.load_pem_x509_certificates((folder / "authority.pem").read_bytes())
     except (OSError, ValueError, TypeError) as error:
         raise InputFileError(
-            path, f"cannot be read with authority.pem ({error}); a folder written by railfix ground keys was expected"
+            path, f"and authority.pem cannot be read ({error}); a folder written by railfix ground keys was expected"
         ) from None
     if not isinstance(key, ec.EllipticCurvePrivateKey) or key.public_key() != certificates[0].public_key():
         raise InputFileError(path, "is not the key of authority.pem")
@@ -165,7 +165,7 @@ def _read_authority(folder: Path) -> tuple[ec.EllipticCurvePrivateKey, x509.Cert
 
 
 def _within(issuer: x509.Certificate, days: int) -> int:
-    """Return a period of validity, limited to the remaining validity of the authority's certificate [days]."""
+    """Return `days`, or the remaining validity of the authority's certificate if that is shorter [days]."""
     return min(days, (issuer.not_valid_after_utc - datetime.now(UTC)).days)
 
 
@@ -174,7 +174,7 @@ def _private(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 
 def _pair(name: str, signing: ec.EllipticCurvePrivateKey, *, days: int) -> dict[str, bytes]:
-    """Return the contents of a new certificate file and key file, by name of the file."""
+    """Return the contents of a new certificate file and of its key file, by file name."""
     key = ec.generate_private_key(ec.SECP256R1())
     certificate = _signed(name, key.public_key(), signing, days=days)
     return {f"{name}.pem": certificate.public_bytes(_PEM), f"{name}.key": _private(key)}

@@ -21,7 +21,7 @@ from railfix.track.network import Network
 
 #: Name of a set of points: number of the station, and end of the station (-1: lower chainage, 1: higher chainage).
 PointName = tuple[int, int]
-#: Largest number of gradients in one authority; the same limit applies to speed restrictions.
+#: Largest number of gradients, and of speed restrictions, in one authority.
 MOST_PARTS: Final = 16
 #: Piece of track: lane, lower chainage [m] and upper chainage [m]. Lane 0 is the single track including the sets of
 #: points; lane 2 k + t is track t of station k.
@@ -45,7 +45,7 @@ class LoopStation(Settings):
 
     @property
     def inner_m(self) -> tuple[float, float]:
-        """Ends of the two tracks between the points [m]."""
+        """Chainages at which the two separate tracks begin and end [m]."""
         return self.begin_m + self.points_m, self.end_m - self.points_m
 
 
@@ -82,17 +82,17 @@ class Layout(Settings):
         return [border for station in self.stations for border in (station.begin_m, station.end_m)]
 
     def stations_between(self, low_m: float, high_m: float) -> range:
-        """Return the numbers of the stations whose range of chainage overlaps an interval."""
+        """Return the numbers of the stations that overlap an interval of chainage."""
         return range(bisect_right(self._borders_m, low_m) // 2, (bisect_left(self._borders_m, high_m) + 1) // 2)
 
     def points_between(self, low_m: float, high_m: float) -> Iterator[PointName]:
-        """Return the points of the stations whose range of chainage overlaps an interval."""
+        """Return the points of each station that overlaps an interval of chainage."""
         last = len(self.stations) - 1
         between = self.stations_between(low_m, high_m)
         return ((k, side) for k in between for side in (-1, 1) if (k, side) not in ((0, -1), (last, 1)))
 
     def blocks_between(self, low_m: float, high_m: float) -> range:
-        """Return the numbers of the blocks in an interval: station k is 2 k + 1, and the line before it is 2 k."""
+        """Return the numbers of the blocks in an interval: 2 k + 1 for station k, and 2 k for the line before it."""
         return range(bisect_left(self._borders_m, low_m), bisect_right(self._borders_m, high_m) + 1)
 
     @cached_property
@@ -117,10 +117,10 @@ class Layout(Settings):
     def gradients_between(self, low_m: float, high_m: float, direction: int) -> tuple[tuple[int, int], ...]:
         """Return chainages [cm] and gradients [1/1000] between two positions.
 
-        Gradients are rounded to the downhill side in running direction.
+        Gradients are rounded so that no descent in running direction is understated.
 
-        If there are more than `MOST_PARTS`, only the first in running direction are returned, all with the steepest
-        descent of the whole range.
+        If there are more than `MOST_PARTS` gradients, only the first in running direction are returned, and the value
+        of each is replaced by the steepest descent of the whole range.
         """
         ends = [gradient.from_m for gradient in self.gradients[1:]] + [math.inf] * bool(self.gradients)
         parts = [
@@ -198,9 +198,9 @@ def overlap(first: Iterable[Piece], second: Sequence[Piece]) -> bool:
     return any(shares(a, b) for a in first for b in second)
 
 
-#: Distance between centrelines from which two tracks are clear of each other [m].
+#: Two tracks are clear of each other if their centrelines are at least this far apart [m].
 CLEAR_M: Final = 3.5
-#: Largest accepted difference between the lengths of the two tracks of a station, which share one chainage [m].
+#: Largest accepted difference between the lengths of a station's two tracks, which use one chainage [m].
 LENGTHS_M: Final = 20.0
 #: Spacing of the positions at which two tracks are compared [m].
 _STEP_M: Final = 2.0
@@ -211,8 +211,8 @@ def derive_layout(network: Network, *, drive: Literal["left", "right"] = "left")
 
     The chainage begins at one end and follows the single track and track 1 of each station. A station is a pair of
     tracks between the same two switches; the line has one track between stations and beyond the outer stations. Points
-    extend from the switch to the position at which the two tracks are `CLEAR_M` apart. Seen by a train that runs toward
-    rising chainage, track 1 of a station is on the side `drive`. Raise MismatchError if the network is not of this
+    extend from the switch to the position at which the two tracks are `CLEAR_M` apart. Track 1 of a station is on the
+    left or right (`drive`), seen in the direction of rising chainage. Raise MismatchError if the network is not of this
     kind: if it has several lines, branches, stations with three tracks, or loops of unequal length.
     """
     ends = network.joints.tolist()
@@ -262,7 +262,7 @@ def _station(names: tuple[str, ...], lengths_m: list[float], lines: list[Floats]
 
 
 def _points_m(network: Network, track: int, *, backward: bool) -> Floats:
-    """Return positions along a track from one end, `_STEP_M` apart; shape (P, 3), ECEF [m]."""
+    """Return positions along a track, `_STEP_M` apart, from its end if `backward`; shape (P, 3), ECEF [m]."""
     rows = slice(int(network.first_point[track]), int(network.first_point[track + 1]))
     chainage, points = network.chainage_m[rows], network.points_m[rows]
     along = np.append(np.arange(0.0, chainage[-1], _STEP_M), chainage[-1])

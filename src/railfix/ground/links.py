@@ -42,12 +42,12 @@ class LinkLimits(Settings):
     #: Longest time from the sending of a frame to its echo; a later echo counts as a miss. A centre delays echoes by up
     #: to 0.2 s.
     answer_s: float = Field(default=1.0, gt=0)
-    misses: int = Field(default=3, ge=1)  #: Number of consecutive misses after which the spare link is used.
-    good: int = Field(default=10, ge=1)  #: Number of consecutive answers before the normal link is used again.
+    misses: int = Field(default=3, ge=1)  #: Consecutive misses on the normal link after which the spare link is used.
+    good: int = Field(default=10, ge=1)  #: Number of consecutive answers on the normal link before it is used again.
     good_s: float = Field(default=30.0, ge=0)  #: Minimum time on the spare link before the normal link is used again.
     window: int = Field(default=60, ge=1)  #: Number of newest frames from which the response rate is computed.
     place_m: float = Field(default=100.0, gt=0)  #: Length of a cell of the coverage map.
-    #: If no packet has arrived for this time after a frame was sent, the connection is opened again, so that trains
+    #: The connection is opened again if no packet arrives within this time after a frame was sent, so that trains
     #: reconnect after a centre was killed.
     idle_s: float = Field(default=5.0, gt=0, le=10)
 
@@ -282,7 +282,7 @@ class TrainLinks:
             await asyncio.sleep(RETRY_S)
 
     def send(self, payload: bytes, *, chainage_m: float | None = None, direction: int = 0) -> None:
-        """Send a frame on both links; in mode "spare" the active link carries the payload, the other an empty probe."""
+        """Send a frame on both links; in mode "spare", the frame on the inactive link is an empty probe."""
         now_ns, now_s = time.monotonic_ns(), time.monotonic()
         self._sequence += 1
         self._newest = payload
@@ -325,7 +325,7 @@ class CentreLinks:
 
     `received` is called with the train's number and the payload. By default, free ports are used; `addresses` contains
     the addresses in use, by bearer. Answers are delayed by up to `wait_s`, to be sent together with a payload.
-    `masquerades` is the number of connections that were rejected because of their certificate. `heard_s` contains the
+    `masquerades` is the number of connections rejected because of the peer's certificate. `heard_s` contains the
     monotonic time of the last received frame, by train and bearer. `alarm` is a sentence if the list of revoked
     certificates cannot be read, otherwise None.
     """
@@ -402,7 +402,7 @@ class CentreLinks:
             try:
                 self._revoked, self.alarm = read_revoked(self._keys), None
             except InputFileError as error:
-                self.alarm = f"{error}; the certificates revoked before are still rejected"
+                self.alarm = f"{error}; the certificates in the last readable list are still rejected"
             for protocol in self._peers.values():
                 if protocol.peer is not None and (protocol.peer.valid_s < 0.0 or self._revoked.has(protocol.peer)):
                     protocol.reject()

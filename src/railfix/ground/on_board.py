@@ -15,19 +15,20 @@ from railfix.ground.braking import BrakeLimits, Steps, Supervised, stopping_m, s
 from railfix.ground.links import LinkMode
 from railfix.ground.positions import Clock
 
-#: Backward movement of the safe front end that counts as rolling back [m]. Position errors are assumed to cause less.
+#: A train has rolled back if its safe front end moves back by more than this, which exceeds position errors [m].
 ROLLED_M: Final = 50.0
 #: Number of newest reports for which the time of sending is stored.
 REMEMBERED: Final = 600
 REPORT_S: Final = 1.0  #: Time between two reports.
-#: Upper limit of `fresh_s` [s]. An authority is rejected if it answers a report older than this.
+#: Upper limit of `fresh_s` [s]. An authority is rejected if the report that it answers is older than the newest report
+#: by more than this.
 LONGEST_FRESH_S: Final = 45.0
 
 
 class OnBoardLimits(BrakeLimits):
     """Limits of the on-board supervision."""
 
-    #: Largest age of the newest authority, counted from the sending of the report that the authority answers.
+    #: The train brakes if its newest authority is older than this, counted from the sending of the answered report.
     fresh_s: float = option(
         "Largest age of the newest authority; the train brakes if the authority is older.",
         15.0,
@@ -36,8 +37,8 @@ class OnBoardLimits(BrakeLimits):
         gt=0,
         le=LONGEST_FRESH_S,
     )
-    #: Longest time without a new position, after which the train brakes. Until then, the last position is extrapolated
-    #: at the train's highest possible speed.
+    #: The train brakes if its newest position is older than this. Until then, the last position is extrapolated at the
+    #: train's highest possible speed.
     placeless_s: float = Field(default=5.0, ge=0)
     clock: Clock = option(
         "Report positions from a recording with the present time, at the recorded pace.", "live", name="--replay"
@@ -65,8 +66,8 @@ class OnBoard:
     """
 
     direction: int
-    #: End of the authority, initially the front end. Authorities move this end forward. At a request of the centre, an
-    #: authority moves the end back if the train can stop before the new end.
+    #: End of the authority, initially the front end. Authorities move this end forward. An authority with which the
+    #: centre requests an earlier end moves the end back if the train can stop before it.
     end_m: float
 
     limits: OnBoardLimits = field(default_factory=OnBoardLimits)
@@ -74,14 +75,13 @@ class OnBoard:
     #: rejected.
     session: int = 0
     number: int = -1  #: Number of the newest authority, -1 before the first.
-    stopped: bool = False  #: Whether the newest authority is an order to stop.
-    order: BrakeOrder | None = None  #: Order to brake that the train obeys.
+    stopped: bool = False  #: Whether the newest authority contains an order to stop.
+    order: BrakeOrder | None = None  #: Order to brake that the train obeys, if any.
     authority: Authority | None = None  #: Newest authority.
-    #: Position at which the train's safe front end would stop if the train braked now; the farther of the last two
-    #: results. If None, the train accepts no shorter end.
+    #: Position at which the train's safe front end would stop if the train braked now: the farther of the results for
+    #: the last two positions. With None, the train accepts no earlier end.
     stops_at_m: float | None = None
-    #: Time at which the newest answered report was sent; None before the first answer.
-    answered_s: float | None = None
+    answered_s: float | None = None  #: Time at which the newest answered report was sent; None before the first answer.
     #: Number of the newest report sent before the last change of ends, or before the train rolled back. Authorities
     #: that answer this or an older report are rejected.
     before_turn: int = -1
@@ -110,8 +110,8 @@ class OnBoard:
     ) -> None:
         """Store the train's safe ends and speed.
 
-        The train accepts a shorter end only if the farther of its last two stopping positions is before this end, so
-        that a single wrong position cannot cause the acceptance.
+        The train accepts an earlier end only if both of its last two stopping positions are before this end, so that a
+        single wrong position does not suffice.
 
         A train that has rolled back brakes until it gets a new authority, because earlier authorities do not cover its
         new position. If position or speed is None, the last position is extrapolated.
@@ -178,7 +178,7 @@ class OnBoard:
     def _ends_order(self, authority: Authority) -> bool:
         """Return whether an authority ends the order to brake.
 
-        Otherwise, only the time at which the answered report was sent is updated.
+        If it does not, this method only updates the time at which the answered report was sent.
         """
         assert self.order is not None
         if authority.number > self.order.number and not authority.stopped:
@@ -203,13 +203,13 @@ class OnBoard:
     def _may_take(self, authority: Authority, *, agrees: bool) -> bool:
         """Return whether an authority may be accepted.
 
-        A shorter end requires `agrees` (the train can stop before it) or an earlier authority. Without an earlier
-        authority, the train brakes until it can accept the shorter end.
+        A train without an authority accepts an earlier end only if it can stop before this end (`agrees`), and brakes
+        until then. A train with an authority accepts the message, but keeps its end unless it agrees.
         """
         return not authority.shortens or agrees or self._granted
 
     def acknowledgement(self) -> dict[str, int]:
-        """Return the fields of a report that acknowledge the newest authority and the order to brake, if received."""
+        """Return a report's fields that acknowledge the newest authority and the order to brake, if there are any."""
         order = {} if self.order is None else {"brake_order": self.order.number}
         if self.number < 0:
             return order
@@ -282,9 +282,9 @@ class OnBoard:
         d = self.direction
         place = d * motion.front_m + self._carried_m(now_s)
         over = stopping_m(place, motion.speed_mps, self._steps(), self.limits) - d * self.end_m
-        overruns = f", {over:.0f} m beyond it" if over > 0.0 else ""
+        overruns = f"; it would stop {over:.0f} m beyond its authority" if over > 0.0 else ""
         target = f"{found.target.speed_mps:.1f} m/s at {d * found.target.at_m:.0f} m"
-        return f"{motion.speed_mps:.1f} m/s, above the {found.intervention_mps:.1f} m/s that lead to {target}{overruns}"
+        return f"{motion.speed_mps:.1f} m/s exceeds {found.intervention_mps:.1f} m/s, the limit for {target}{overruns}"
 
     def turn(self, direction: int, front_m: float) -> None:
         """Change ends to a new running direction; the train then has no authority."""

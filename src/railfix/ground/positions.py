@@ -26,7 +26,7 @@ async def read_positions(
 ) -> AsyncIterator[TrainMessage]:
     """Yield the position messages decoded from lines; call `rejected` with the reason for each invalid line.
 
-    With the clock "replay", messages are delayed to the pace of the recording, and their times are replaced by the
+    With the clock "replay", messages are yielded at the pace of the recording, and their times are replaced by the
     present time, so that the centre accepts the positions as new.
     """
     first: tuple[int, int] | None = None
@@ -51,7 +51,7 @@ async def read_positions(
 
 
 async def standard_input() -> AsyncIterator[str]:
-    """Yield lines of the standard input as they arrive; the program can end while it waits for a line.
+    """Yield lines of the standard input as they arrive; a pending read does not keep the program from ending.
 
     Lines are cut at `LONGEST_LINE`; a cut line is not a valid message.
     """

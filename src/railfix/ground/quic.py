@@ -38,9 +38,9 @@ IDLE_S: Final = 10.0
 WAIT_S: Final = 0.2
 #: Longest time for which a QUIC acknowledgement is delayed, in order to be sent with a frame [s].
 ACKNOWLEDGE_S: Final = 1.5
-#: Largest number of handshakes of one peer in progress; further handshakes wait.
+#: Largest number of concurrent handshakes with one peer; further handshakes wait.
 MOST_OF_PEER: Final = 16
-#: Largest number of handshakes of all peers in progress; further handshakes wait.
+#: Largest number of concurrent handshakes with all peers together; further handshakes wait.
 MOST_HANDSHAKES: Final = 64
 #: Time after which a handshake in progress is ended if another handshake waits [s]; by then, the peer has given up.
 HANDSHAKE_S: Final = 5.0
@@ -55,7 +55,7 @@ RECEIVE_BYTES: Final = 1 << 22
 TURN: Final = 16
 #: Time after which a waiting packet of a connected peer is dropped, because the peer has sent a newer message [s].
 LATE_S: Final = 1.0
-#: Largest number of waiting handshake packets, and largest number of packets that are read at a time.
+#: Largest number of waiting handshake packets; also the largest number of packets read at a time.
 MOST_WAITING: Final = 1024
 _REJECTED: Final = 0x101
 
@@ -143,7 +143,7 @@ class LinkProtocol(QuicConnectionProtocol):
         self._received = received
         self._rejected = rejected
         self._wait_s = wait_s
-        #: Function called once, at the first packet from the other end.
+        #: Function called once, when the first packet from the other end arrives.
         self.patience: Callable[[], None] | None = None
         self.unanswered_s: float | None = None  #: Time of the first message sent since the last received packet [s].
         self._answers: list[Callable[[], bytes]] = []
@@ -233,7 +233,7 @@ class LinkProtocol(QuicConnectionProtocol):
         self.transmit()
 
     async def wait_silent(self, idle_s: float) -> None:
-        """Wait until the connection is closed, or no packet has arrived for `idle_s` since a message was sent.
+        """Wait until the connection is closed, or no packet has arrived within `idle_s` after a message was sent.
 
         The idle time-out of QUIC would be too long: it is at least three times the probe time-out, which grows with the
         variation of round trips.
@@ -250,7 +250,7 @@ class LinkProtocol(QuicConnectionProtocol):
 
 @contextmanager
 def address_errors(host: str, port: int) -> Iterator[None]:
-    """Context manager that adds the address and the remedy to an OSError raised on listening at an address."""
+    """Context manager that adds the address and a remedy to the OSError of a failed attempt to listen."""
     try:
         yield
     except OSError as error:
@@ -398,7 +398,7 @@ async def connection(
     """Connect to a server from the local address of a bearer; a first packet must arrive within `timeout_s`.
 
     The connection must then be established within three times `timeout_s`. Raise ConnectionError or TimeoutError if the
-    other end rejects the certificate, has another name, or does not answer.
+    other end rejects the certificate, does not have the expected name, or does not answer.
     """
     loop = asyncio.get_running_loop()
     transport, protocol = await loop.create_datagram_endpoint(
@@ -413,7 +413,7 @@ async def connection(
         yield protocol
     finally:
         protocol.patience = None
-        protocol._connected_waiter = None  # after a time-out, nothing would retrieve the error that closing sets
+        protocol._connected_waiter = None  # after a time-out, `close` would set an error that nothing retrieves
         protocol.close()
         await asyncio.sleep(0)
         transport.close()

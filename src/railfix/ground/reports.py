@@ -5,8 +5,8 @@
 
 The safe rear end moves to a position that two consecutive reports confirm. Both reports must state that the train is
 complete and has the configured length. A report that contradicts the record of its train stops this train and the
-trains next to it. After any contradiction, the interval is extended to the reported position, but no farther than the
-train can have run.
+nearest trains on either side. After any contradiction, the interval is extended to the reported position, but no
+farther than the train can have run.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from railfix.io.train_message import MessageStatus, TrainMessage, Unknown
 
 #: Largest difference between the reported and the configured train length that is attributed to rounding [m].
 LENGTH_ROUNDING_M: Final = 0.02
-#: Largest reported speed of a train at standstill, and largest backward speed that does not count as running backward
-#: [m/s].
+#: With a higher reported speed, a reported standstill is a contradiction, and motion toward the rear end counts as
+#: running backward [m/s].
 STANDING_MPS: Final = 0.5
 SPEED_ERROR_MPS: Final = 1.0  #: Largest assumed error of a reported speed.
-#: Largest sum of the over-reading and under-reading amounts of an accepted report [m].
+#: A report with a larger sum of the over-reading and under-reading amounts counts as contradictory [m].
 WIDEST_M: Final = 1000.0
-#: Shortest time between two positions that is assumed when an interval is extended [s]. It also covers the largest age
-#: of a position at sending.
+#: When an interval is extended, a shorter time between two positions is replaced by this time [s], which also covers
+#: the largest age of a position at sending.
 INSTANT_S: Final = 5.0
 
 
@@ -63,10 +63,10 @@ class PlacedReport:
     message: TrainMessage
     layout: Layout
     limits: InterlockingLimits
-    granted: int  #: Highest number of the authorities sent so far.
-    skipped: tuple[int, int]  #: `Interlocking.skipped`.
-    #: Longest time since the previous position [s]. It is negative if the new position is older than the previous
-    #: position, and None if unknown, as at the first report.
+    granted: int  #: Number of the newest authority sent so far.
+    skipped: tuple[int, int]  #: Authority numbers skipped at the start (`Interlocking.skipped`).
+    #: Upper bound of the time from the previous position to this position [s]. It is negative if this position is
+    #: older, and None if unknown, as at the first report.
     elapsed_s: float | None
 
     @property
@@ -101,7 +101,7 @@ class PlacedReport:
 
     @property
     def held_m(self) -> float | None:
-        """End of the authority that the report names, within the line [m]; None if the report names no authority."""
+        """End of the authority named by the report, limited to the line [m]; None if the report names none."""
         end_cm, stations = self.message.authority_end_cm, self.layout.stations
         return None if end_cm is None else min(max(end_cm / 100.0, stations[0].begin_m), stations[-1].end_m)
 
@@ -119,7 +119,7 @@ def no_length(report: PlacedReport) -> str | None:
 def other_line(report: PlacedReport) -> str | None:
     """Return a contradiction if a report is from another line, otherwise None."""
     line, known = report.message.line, report.known.line
-    return None if known in (None, line) else f"the report is of line {line}, the train is on line {known}"
+    return None if known in (None, line) else f"the report names line {line}, but the train is on line {known}"
 
 
 def wide_bounds(report: PlacedReport) -> str | None:
@@ -147,7 +147,7 @@ def unknown_authority(report: PlacedReport) -> str | None:
     if held <= report.granted and not last < held < first:
         return None
     newest = f"at the last start was {last}" if held < first else f"is {report.granted}"
-    return f"the train has authority {held}, the newest in the centre's database {newest}"
+    return f"the train has authority {held}, but the newest in the centre's database {newest}"
 
 
 def wrong_turn(report: PlacedReport) -> str | None:
@@ -155,7 +155,7 @@ def wrong_turn(report: PlacedReport) -> str | None:
     if not report.turns:
         return None
     if not report.message.standstill:
-        return "the train has changed ends while it runs"
+        return "the train has changed ends while running"
     known, facing = report.known, report.message.facing
     if facing * report.front_m - report.over_m > facing * known.rear_m:
         return "the train has changed ends and is behind its interval"
@@ -266,7 +266,7 @@ def covered_m(report: PlacedReport) -> tuple[float, float]:
 
 
 def _noted(report: PlacedReport, **interval: Any) -> TrainInterval:
-    """Return the train's record with the data of a report (possibly contradicted) and the changes in `interval`."""
+    """Return the train's record with the data of a report, even if contradicted, and with the values `interval`."""
     message = report.message
     low, high = sorted((report.rear_m, report.ahead_m))
     noted: dict[str, Any] = {
@@ -285,7 +285,7 @@ def _noted(report: PlacedReport, **interval: Any) -> TrainInterval:
 
 
 def _runs_by(report: PlacedReport) -> int | None:
-    """Return `TrainInterval.runs_by` after a report."""
+    """Return the new value of `TrainInterval.runs_by` after a report."""
     newest = max((n for n in (report.known.runs_by, report.message.authority) if n is not None), default=None)
     order = report.message.brake_order
     return None if newest is None or (order is not None and order >= newest) else newest
@@ -311,8 +311,8 @@ def report_received(
 
     A change of ends is accepted only at standstill inside the train's station; afterwards the interval still includes
     the earlier position. A report that contradicts the train's record stops the train, and can only extend the
-    interval. Reports without a position, and reports older than the newest, have no effect. `elapsed_s` is the longest
-    time since the previous position according to the centre's clock, or None.
+    interval. Reports without a position, and reports older than the newest, have no effect. `elapsed_s` is an upper
+    bound of the time since the previous position by the centre's clock, None if unknown.
     """
     before = state.trains.get(message.train)
     if before is None or not is_placed(message) or not is_newer(before, message):
@@ -355,7 +355,7 @@ def furthest(facing: int, agreed_m: float, known_m: float) -> float:
 
 
 def _elapsed_s(known: TrainInterval, message: TrainMessage, by_centre_s: float | None) -> float | None:
-    """Return the longest time since the previous position, computed with the clocks of the train and the centre [s]."""
+    """Return an upper bound of the time since the previous position, by the clocks of train and centre [s]."""
     if known.measured_ns is None or (message.session or 0) != known.session:
         return by_centre_s
     by_train_s = (message.time_ns - known.measured_ns) / 1e9
@@ -363,7 +363,7 @@ def _elapsed_s(known: TrainInterval, message: TrainMessage, by_centre_s: float |
     return by_train_s if by_centre_s is None or by_train_s < 0.0 else max(min(by_train_s, by_centre_s), 0.0)
 
 
-#: Reported authority numbers from this value on are not adopted for the next authorities.
+#: The numbers of later authorities do not continue from a reported number that is this value or higher.
 _MOST_NUMBERS: Final = 1 << 62
 
 

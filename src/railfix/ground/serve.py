@@ -42,7 +42,7 @@ from railfix.track.network_read import read_network
 
 #: Period of the centre's steps [s].
 STEP_S = 0.1
-#: Longest wait at the end of the process for a commit in progress [s].
+#: At its end, the process waits at most this long for a commit in progress [s].
 ENDING_S = 3.0
 #: Thresholds of the garbage collector, chosen so that full collections are rare; a full collection takes 0.3 s with a
 #: thousand connections.
@@ -96,14 +96,14 @@ class CentreFile(Settings):
     keys: Path  #: Folder with ``authority.pem``, ``centre.pem`` and ``centre.key``, written by ``railfix ground keys``.
     listen: dict[LinkName, Address]  #: Address at which the centre listens on each bearer.
     stations: tuple[LoopStation, ...] = ()  #: Stations of the line, unless `network` is given.
-    #: Map files of a network of tracks that is one single line with passing loops (`railfix.ground.layout`).
+    #: Map files of the tracks, which must be a single line with passing loops (`railfix.ground.layout`).
     network: tuple[Path, ...] = ()
     gradients: tuple[Gradient, ...] = ()  #: Gradients of the line, in order of chainage.
     #: Sections (stations, ``NAME track 1``, ``NAME to NAME``) with a detection system. This system must send the order
     #: ``detect-section`` at least every `InterlockingLimits.detection_s`; otherwise, the state of the section is
     #: unknown.
     detected_sections: tuple[str, ...] = ()
-    drive: Literal["left", "right"] = "left"  #: Side on which trains run through a station of the network.
+    drive: Literal["left", "right"] = "left"  #: Side on which trains run through stations derived from `network`.
     #: Trains, with their positions at the first start; at later starts, positions are read from the database.
     trains: Annotated[tuple[TrainPlace, ...], Field(min_length=1)]
     database: str = "centre.db"  #: SQLite file, or the address of an SQL database (``postgresql+psycopg://...``).
@@ -113,8 +113,8 @@ class CentreFile(Settings):
     speed_mps: float = Field(default=20.0, gt=0)  #: Highest speed of the reference run curve, for simulated running.
     #: Time that simulated points take to move; railfix has no interface to real points.
     points_s: float = Field(default=5.0, ge=0)
-    #: Reference triangle that monitors satellite positioning. With a triangle, all trains are stopped at the first
-    #: start until the stop is released by hand. Without a triangle, satellite positioning is not monitored.
+    #: Reference triangle that monitors satellite positioning. With a triangle, all trains are stopped from the first
+    #: start until a release by hand. Without a triangle, satellite positioning is not monitored.
     triangle: TriangleInputs | None = None
     centre: CentreLimits = CentreLimits()  #: Limits for the reports of trains.
     interlocking: InterlockingLimits = InterlockingLimits()  #: Limits of the interlocking.
@@ -141,8 +141,8 @@ class CentreFile(Settings):
                 tracks = {station.name: "{:.0f} to {:.0f} m".format(*station.inner_m) for station in layout.stations}
                 where = tracks.get(train.station, f"none, the stations are {', '.join(tracks)}")
                 raise ValueError(
-                    f"train {train.number} is not between the points of {train.station} ({where}): with its "
-                    f"bounds it is at {low - train.bound_m:.0f} to {high + train.bound_m:.0f} m"
+                    f"train {train.number} is not between the points of {train.station} ({where}): within its "
+                    f"bounds, it extends from {low - train.bound_m:.0f} to {high + train.bound_m:.0f} m"
                 )
         places = [(train.station, train.track) for train in self.trains]
         if len(set(places)) < len(places):
@@ -195,15 +195,15 @@ async def run_centre(
     for_s: float | None = None,
     announce: Callable[[str], None] = lambda _: None,
 ) -> tuple[bool, dict[str, Any]]:
-    """Run the centre that a file configures (`CentreFile`), until SIGINT or SIGTERM or for a given time.
+    """Run the centre configured by a file (`CentreFile`) until SIGINT or SIGTERM, or until `for_s` has passed.
 
     Return whether SIGTERM ended the centre, and counts of reports, routes and rejected frames.
 
     `page` is the host and port of the page, where port 0 selects a free port. At addresses other than loopback, the
     page is served over TLS with the centre's certificate. Orders require `password`, or a personal password from
     `people` (by name of the person). `orders` is a separate address for orders, by default the page's address.
-    `announce` is called with each address once trains can connect. Raise InputFileError if the file, a key or the
-    database cannot be read. Raise SettingsError if a setting is wrong, or an address is not available.
+    `announce` is called with each address of the page as soon as trains can connect. Raise InputFileError if the file,
+    a key or the database cannot be read. Raise SettingsError if a setting is wrong, or an address is not available.
     """
     settings = load_settings(CentreFile, path, what="a file of a centre").with_stations(path.parent)
     keys = path.parent / settings.keys
@@ -342,7 +342,7 @@ def _heard(control: ControlCentre, links: CentreLinks) -> list[dict[str, Any]]:
 async def _work(control: ControlCentre, points: SimulatedPoints) -> None:
     """Run a step of the centre every `STEP_S`.
 
-    Steps take at most half of the time, so that the links can receive frames in the same event loop.
+    The pause after a step is at least as long as the step, so that the links receive frames in the same event loop.
     """
     loop = asyncio.get_running_loop()
     due = loop.time()
@@ -389,7 +389,7 @@ def _check_line(settings: CentreFile, store: Store, path: Path) -> None:
         if before.get(name) != under.get(name):
             was, is_now = before.get(name, "absent"), under.get(name, "absent")
             raise InputFileError(
-                path, f"{name} is {is_now}, in the database {was}; restore the file, or choose another database"
+                path, f"{name} is {is_now}, but was {was} in the database; restore the file, or choose another database"
             )
     if text is None:
         store.save(documents={_BELONGS_TO: json.dumps(under)})

@@ -1,7 +1,7 @@
-"""State of the interlocking: intervals of trains, points, bars and speed restrictions.
+"""State of the interlocking: intervals of trains, points, closed sections and speed restrictions.
 
-The state is stored as texts: one head text, one text per train, and one text per set of points. Values are immutable:
-each step returns new values.
+The state is stored as several strings: a common string, one for each train, and one for each set of points. Values are
+immutable: each step returns new values.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from railfix.ground.layout import PointName
 class InterlockingLimits(Settings):
     """Limits of the interlocking."""
 
-    #: Distance by which a movement authority ends short of the obstacle or signal that limits it.
+    #: Distance from the end of an authority to the obstacle, points or end of track that limit it, plus `overlap_m`.
     margin_m: float = Field(default=20.0, ge=0)
     #: Distance kept free beyond the end of an authority for a train that passes the end at release speed. With 0, there
     #: is no release speed.
     overlap_m: float = Field(default=0.0, ge=0)
-    #: Time from the passage of a train's safe rear end to the release of the points.
+    #: Points are released this time after a train's safe rear end has passed them.
     release_s: float = Field(default=3.0, ge=0)
-    #: Longest time until the field answers a request for the detection of points. After this time, trains on these
-    #: points are stopped.
+    #: Trains on points are stopped if the trackside does not answer a request for the points' detection within this
+    #: time.
     answer_s: float = Field(default=10.0, gt=0)
-    #: Longest time between two answers of a section's detection; after this time, the section's state is unknown.
+    #: Longest time between two messages of a section's detection; after this time, the section's state is unknown.
     detection_s: float = Field(default=10.0, gt=0)
     speed_mps: float = Field(default=60.0, gt=0)  #: Highest speed of a train.
-    #: Highest acceleration and deceleration of a train; used between two reports that have speeds.
+    #: Highest acceleration and deceleration of a train, to limit its distance between two reports with speeds.
     acceleration_mps2: float = Field(default=2.0, gt=0)
 
 
@@ -66,21 +66,21 @@ class TrainInterval:
     #: Ends of the train according to the newest report with a position, even if that report contradicts the record;
     #: lower chainage first [m].
     reported_m: tuple[float, float] | None = None
-    contradiction: str | None = None  #: Contradiction between the newest report and the record, or None.
+    contradiction: str | None = None  #: Contradiction between the newest report and the record; None if there is none.
     held_end_m: float | None = None  #: End of the train's authority according to its newest report.
     #: Number of the newest authority that may permit the train to run, sent by the centre or acknowledged by a report.
     #: None before the first authority. Also None after a report that acknowledges an order to brake with this or a
     #: higher number, because no authority in transit can end that order.
     runs_by: int | None = None
-    stop: str | None = None  #: Reason why the train is stopped, or None. The reason is kept until a release by hand.
-    asked_m: float | None = None  #: Shorter end of the authority that the train is requested to accept.
-    asked_number: int = 0  #: Number of the first authority that requests the shorter end.
-    held: bool = False  #: Whether the train has returned a route; the next route is then set by hand.
+    stop: str | None = None  #: Reason why the train is stopped, kept until a release by hand; None if it is not.
+    asked_m: float | None = None  #: Earlier end of the authority that the train is requested to accept, if any.
+    asked_number: int = 0  #: Number of the first authority that requests the earlier end.
+    held: bool = False  #: Whether the train has given back its route; its next route is then set by hand.
     #: Number of the train that was divided from the rear of this train, until the two trains are apart.
     parted: int | None = None
 
     def changed(self, **values: Any) -> Self:
-        """Return a copy with changes, faster than `dataclasses.replace`; raise TypeError for an unknown name."""
+        """Return a copy with changed fields, faster than `dataclasses.replace`; raise TypeError for an unknown name."""
         if not values.keys() <= _NAMES[TrainInterval]:
             raise TypeError(
                 f"a train has no fields of these names: {', '.join(sorted(values.keys() - _NAMES[TrainInterval]))}"
@@ -129,9 +129,8 @@ class PointState:
     """State of a set of points in the interlocking."""
 
     wanted: int = 1  #: Commanded track.
-    detected: int | None = 1  #: Detected track; None while the points move, or before the field has answered.
-    #: Whether the command to move to `wanted` has been given, or is not needed.
-    commanded: bool = True
+    detected: int | None = 1  #: Detected track; None while the points move, or before the trackside answers.
+    commanded: bool = True  #: Whether the command to move to `wanted` has been given, or is not needed.
     #: Trains that lock the points, each with the time at which its lock ends [s]. The time is None until the train's
     #: rear end has passed.
     locked: Mapping[int, float | None] = field(default_factory=dict)
@@ -142,7 +141,7 @@ class PointState:
         return self.detected == self.wanted
 
 
-#: Names of the fields of stored records.
+#: Names of the stored fields of trains and points.
 _NAMES: Final = {
     kind: dict.fromkeys(field.name for field in fields(kind)).keys() for kind in (TrainInterval, PointState)
 }
@@ -163,9 +162,9 @@ class Interlocking:
     trains: Mapping[int, TrainInterval]
     points: Mapping[PointName, PointState]
     stopped: bool = False  #: Whether satellite positioning is suspended: no authority is extended, and no route is set.
-    granted: int = 0  #: Highest number of the authorities sent so far.
-    #: Last authority number in the database at this start, and first number issued since. Authorities with numbers
-    #: between these two were issued by a centre with a newer state than the stored state.
+    granted: int = 0  #: Number of the newest authority sent so far.
+    #: Last authority number in the database when the centre was started, and first number after this start. Authorities
+    #: with numbers between these two were issued by a centre with a newer state than the stored state.
     skipped: tuple[int, int] = (0, 0)
     #: Sections (`Layout.sections`) into which no authority may reach, each with the reason
     #: (`railfix.ground.stops.CLOSED`, `OCCUPIED` or `UNKNOWN`).
@@ -187,15 +186,15 @@ def stop_trains(state: Interlocking, trains: Iterable[int], reason: str) -> Inte
     return state
 
 
-#: Name of the head text. The names of the texts of trains and points begin with this name.
+#: Name of the stored string with the common state. The names of the strings of trains and points begin with it.
 HEAD: Final = "interlocking"
 _TRAIN, _POINTS = f"{HEAD} train ", f"{HEAD} points "
 
 
 def to_documents(state: Interlocking, before: Interlocking | None = None) -> dict[str, str | None]:
-    """Return the texts of a state by name.
+    """Return the strings of a state by name.
 
-    With a previous state `before`, only texts that may have changed are returned, and None for each text to be removed.
+    With a previous state `before`, only strings that may have changed are returned, and None for each string to remove.
     """
     head = {
         "stopped": state.stopped,
@@ -216,11 +215,11 @@ def to_documents(state: Interlocking, before: Interlocking | None = None) -> dic
 
 
 def from_documents(texts: Mapping[str, str | None]) -> Interlocking:
-    """Return the state from its texts.
+    """Return the state from its strings.
 
-    The times until points are released start again, because the clock of the earlier process is unknown.
+    Points wait again for their full release time, because the clock of the earlier process is unknown.
 
-    Raise InputFileError if the texts were written by an older version.
+    Raise InputFileError if the strings were written by an older version.
     """
     head = json.loads(texts[HEAD] or "")
     names = {field.name for field in fields(TrainInterval)}
@@ -242,7 +241,7 @@ def from_documents(texts: Mapping[str, str | None]) -> Interlocking:
             values = json.loads(text or "")
             station, side = map(int, name.removeprefix(_POINTS).split())
             points[station, side] = PointState(**values | {"locked": dict.fromkeys(map(int, values["locked"]))})
-    # sorted, so that the result does not depend on the order of the texts
+    # sorted, so that the result does not depend on the order of the strings
     return Interlocking(
         trains=dict(sorted(trains.items())), points=dict(sorted(points.items())), stopped=head["stopped"],
         granted=head["granted"], bars=frozenset((name, kind) for name, kind in head["bars"]),

@@ -1,7 +1,7 @@
 """Stops of one train, all trains, a section, or trains whose intervals overlap, and the release of trains by hand.
 
-Until the release, every granted interval stays occupied. A train accepts a shorter end of its authority if it can stop
-before this end. Every authority sent after the request has the shorter end, and the train rejects authorities with
+Until the release, every granted interval stays occupied. A train accepts an earlier end of its authority if it can stop
+before this end. Every authority sent after the request has the earlier end, and the train rejects authorities with
 lower numbers. A late authority can therefore not move the end forward again.
 """
 
@@ -16,9 +16,9 @@ from railfix.ground.layout import Layout, Piece, PointName, overlap
 from railfix.ground.state import ROUNDING_M, Interlocking, InterlockingLimits, TrainInterval, stop_trains, with_train
 from railfix.io.train_message import TrainMessage
 
-#: Reasons why a section is barred: `CLOSED` by hand; `OCCUPIED` by vehicles that do not report, as entered by hand or
-#: as detected; or `UNKNOWN`, because the detection of the section has not answered. For the reasons in `BARS`, trains
-#: inside the section are stopped.
+#: Reasons why no authority may reach into a section: `CLOSED` by hand; `OCCUPIED` by vehicles that do not report, as
+#: entered by hand or as detected; or `UNKNOWN`, because the section's detection has not answered. For the reasons in
+#: `BARS`, trains inside the section are stopped.
 CLOSED: Final = "closed"
 OCCUPIED: Final = "occupied by vehicles that report nothing"
 UNKNOWN: Final = "unknown to its detection"
@@ -133,7 +133,7 @@ def points_refused(state: Interlocking, train: TrainInterval, under: Iterable[Po
 
 
 def bar_over(state: Interlocking, train: TrainInterval, layout: Layout) -> tuple[str, str] | None:
-    """Return a section in a train's interval barred for a reason in `BARS`, and this reason; None if there is none."""
+    """Return a section in a train's interval that is closed for a reason in `BARS`, and this reason, or None."""
     occupied = pieces_of(train, layout)
     bars = (bar for bar in sorted(state.bars) if bar[1] in BARS)
     return next((bar for bar in bars if overlap(layout.sections[bar[0]], occupied)), None)
@@ -142,7 +142,7 @@ def bar_over(state: Interlocking, train: TrainInterval, layout: Layout) -> tuple
 def close_section(
     state: Interlocking, section: str, layout: Layout, reason: str, *, kind: str = CLOSED
 ) -> Interlocking:
-    """Return the state with a section barred; no authority is extended into it, and trains inside are stopped."""
+    """Return the state with a section closed; no authority is extended into it, and trains inside are stopped."""
     state = replace(state, bars=state.bars | {(section, kind)})
     pieces = layout.sections[section]
     inside = [number for number, train in state.trains.items() if overlap(pieces, pieces_of(train, layout))]
@@ -150,12 +150,12 @@ def close_section(
 
 
 def open_section(state: Interlocking, section: str, kind: str = CLOSED) -> Interlocking:
-    """Return the state with one bar of a section removed; trains that the bar has stopped must be released by hand."""
+    """Return the state without one reason for closing a section; trains stopped for it must be released by hand."""
     return replace(state, bars=state.bars - {(section, kind)})
 
 
 def occupied_detected(state: Interlocking, layout: Layout, sections: Iterable[str]) -> Interlocking:
-    """Bar the sections that are detected as occupied and overlap no train's interval; return the new state."""
+    """Close the sections that are detected as occupied and overlap no train's interval; return the new state."""
     for section in sections:
         pieces = layout.sections[section]
         if (section, OCCUPIED) not in state.bars and not any(
@@ -185,7 +185,7 @@ def ask_route_back(
 
 
 def answer_received(state: Interlocking, message: TrainMessage) -> Interlocking:
-    """Return the state after a report that may answer a request for a shorter end.
+    """Return the state after a report that may answer a request for an earlier end of the authority.
 
     The route is released if the train agrees, otherwise it is kept. While a train is stopped, its answers are not used,
     because its reports may be wrong.
@@ -209,13 +209,13 @@ def answer_received(state: Interlocking, message: TrainMessage) -> Interlocking:
 
 
 def answers(known: TrainInterval, message: TrainMessage) -> bool:
-    """Return whether a report answers an authority that requests a shorter end."""
+    """Return whether a report answers an authority that requests an earlier end."""
     held = message.authority
     return held is not None and message.authority_end_cm is not None and held >= known.asked_number
 
 
 def holds_more_than_asked(known: TrainInterval, message: TrainMessage) -> bool:
-    """Return whether a train has a longer authority than requested, or is beyond the requested end."""
+    """Return whether a train's authority ends beyond the requested end, or the train is beyond this end."""
     d = known.direction
     assert known.asked_m is not None
     further = max(d * (message.authority_end_cm or 0) / 100.0, d * known.front_m)

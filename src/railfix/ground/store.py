@@ -76,7 +76,7 @@ class Store:
         self._token: str | None = None
         self._lock: IO[str] | None = None
         self._notes: list[dict[str, Any]] = []
-        self.abandoned = False  #: Whether a thread whose commit has not ended still uses the connection.
+        self.abandoned = False  #: Whether a commit in a thread may still use the connection.
         self._most_lines, self._written = most_lines, 0
 
     def take_charge(self) -> None:
@@ -226,7 +226,7 @@ def _time_outs(url: str) -> dict[str, Any]:
 
 
 def _durable(connection: Any, _record: object) -> None:
-    """Set an SQLite connection to write-ahead logging, with each commit on disk before it returns."""
+    """Set an SQLite connection to write-ahead logging; a commit returns only when its data are on disk."""
     cursor = connection.cursor()
     for pragma in ("journal_mode=WAL", "synchronous=FULL", "busy_timeout=1000"):
         cursor.execute(f"PRAGMA {pragma}")

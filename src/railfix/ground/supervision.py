@@ -1,4 +1,4 @@
-"""Supervision of a line's trains by the centre, without input or output: authorities are computed from reports.
+"""Supervision of a line's trains by the centre: computes authorities from reports, and does no input or output.
 
 The supervision is used by `railfix.ground.control` (the centre with store and page) and by simulated traffic
 (`railfix.ground.traffic`).
@@ -37,14 +37,14 @@ from railfix.ground.stops import (
 )
 from railfix.io.train_message import TrainMessage
 
-#: Distance from the end of a train's track within which the train gets the next route [m].
+#: A train gets its next route when its front end is less than this from the end of its track [m].
 ROUTE_AHEAD_M = 700.0
 #: Longest time between two authorities to a train [s]. A train also gets an authority after each report, and when its
 #: stop begins or ends.
 AUTHORITY_S = 1.0
-#: Smallest number of authority numbers that are skipped at a restart.
+#: At a restart, at least this many authority numbers are skipped.
 SKIPPED: Final = 1 << 20
-#: Time after which an authority has lapsed on board, counted from the report that it answers [s]; above
+#: An authority counts as lapsed on board when the report that it answers is older than this [s]. This time must exceed
 #: `LONGEST_FRESH_S`.
 LAPSED_S: Final = 60.0
 #: Largest relative drift between the clocks of a train and the centre.
@@ -68,7 +68,7 @@ class Supervision:
     heard: set[int] = field(default_factory=set)  #: Trains that have reported since authorities were last computed.
     #: Time at which the last authority was sent to each train [s], and whether this authority was an order to stop.
     sent: dict[int, tuple[float, bool]] = field(default_factory=dict)
-    #: Time at which each train was last sent an authority that permits it to run [s].
+    #: Time at which the newest authority that permits the train to run was sent, by train [s].
     granted_s: dict[int, float] = field(default_factory=dict)
 
     #: Order to brake of each stopped train: time of the last sending [s] (infinite once acknowledged), and number.
@@ -80,7 +80,7 @@ class Supervision:
     awaited: set[int] = field(default_factory=set)
     #: Whether each section is detected as occupied; None if there is no answer, or the last answer is too old.
     detected: dict[str, bool | None] = field(default_factory=dict)
-    #: Time of the last answer of each section detection that must answer repeatedly [s].
+    #: Time of the newest message of each section's detection, which must send messages regularly [s].
     answered_s: dict[str, float] = field(default_factory=dict)
 
     _clocks: dict[int, tuple[float, float]] = field(default_factory=dict)
@@ -104,7 +104,7 @@ class Supervision:
                 self.awaited.discard(number)
             elapsed_s, clock, is_new = self._read_clock(message, before, now_s)
             self.state = report_received(self.state, message, self.layout, limits=self.limits, elapsed_s=elapsed_s)
-            # a clock delay from a contradicted report could lengthen the distances that are accepted later
+            # with a clock delay from a contradicted report, later checks could accept too long distances
             if is_new or self.state.trains[number].contradiction is None:
                 self._clocks[number] = clock
             self.state = answer_received(self.state, message)
@@ -128,12 +128,12 @@ class Supervision:
     def _read_clock(
         self, message: TrainMessage, record: TrainRecord, now_s: float
     ) -> tuple[float | None, tuple[float, float], bool]:
-        """Return the longest time since the train's previous position [s], its clock's delay, and whether the clock is
-        new.
+        """Return an upper bound of the time since the previous position [s], the delay of the train's clock, and
+        whether this clock is new.
 
-        The time is None if unknown. It is computed with the least delay of earlier reports, or after a restart on board
-        with the centre's clock alone. The delay [s] is returned with the time at which it was observed. A clock that
-        was set back counts as new, because its earlier delays would make the time since later positions too long.
+        The bound is None if unknown. It is computed with the least delay of earlier reports; after a restart on board,
+        with the centre's clock alone. The delay behind the centre's clock [s] is returned with the time of its
+        observation. A clock that was set back counts as new, because its earlier delays make later bounds too long.
         """
         number = message.train
         known, tolerance_s = self.state.trains[number], self.centre.clock_s
@@ -173,12 +173,12 @@ class Supervision:
     def begin_again(self, now_s: float, *, wall_us: int) -> tuple[PointName, ...]:
         """Begin with a stored state, which may be an older copy; return the points whose detection must be requested.
 
-        No authority is extended until every train has acknowledged an authority or an order to brake of this start. The
-        acknowledging report also states the end of the train's authority, which the database may not contain. The train
-        then rejects late authorities of the earlier process. The stored detection of points is dropped.
+        No authority is extended until every train has acknowledged an authority or an order to brake sent since this
+        start. The acknowledging report states the end of the train's authority, which the database may not contain. The
+        train then rejects late authorities of the earlier process. Stored detections are dropped.
 
-        Authority numbers begin at the time of the computer's clock `wall_us` [us], so that they exceed the numbers of
-        every earlier start. If the computer's clock was set back, the numbers still exceed those in the database.
+        The first authority number is the computer's time `wall_us` [us], so that it exceeds the numbers of earlier
+        starts. If the computer's clock was set back, the numbers still exceed those in the database.
         """
         self.awaited, self.begun_s, last = set(self.state.trains), now_s, self.state.granted
         first = max(last + SKIPPED, wall_us)
@@ -191,8 +191,8 @@ class Supervision:
     def set_section_detected(self, section: str, occupied: bool | None, now_s: float = -math.inf) -> None:
         """Process the detection of a section: occupied, free, or None if unknown.
 
-        An occupied section is compared with the intervals of the trains at once. Otherwise, a wrong report that arrives
-        later could extend an interval into the section, and the occupation would be attributed to that train.
+        An occupied section is immediately compared with the intervals of the trains. Otherwise, a wrong report that
+        arrives later could extend an interval into the section, and the occupation would be attributed to that train.
         """
         self.detected[section] = occupied
         if section in self.answered_s:
@@ -207,7 +207,7 @@ class Supervision:
     def set_route(self, train: int, **step: Any) -> str | None:
         """Set a route to the next station; return the reason for a refusal.
 
-        `step` contains the arguments `nearby` and `stopped` of `route_requested`. The points move after
+        The keyword arguments `step` (`nearby` and `stopped`) are passed to `route_requested`. The points move after
         `command_points` is called.
         """
         if train not in self.state.trains:
@@ -263,7 +263,7 @@ class Supervision:
                 del self._asked_s[point]
                 low, high = self.layout.zone_m(point)
                 on = [n for n in self.state.points[point].locked if self.state.trains[n].overlaps(low, high)]
-                self.state = stop_trains(self.state, on, "the field does not answer for points of its route")
+                self.state = stop_trains(self.state, on, "the trackside does not answer for points of its route")
         stops = stop_orders(self.state)
         if self.state.stopped:
             stops = dict.fromkeys(self.state.trains, "satellite positioning is suspended") | stops

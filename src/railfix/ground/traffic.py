@@ -195,7 +195,7 @@ class Traffic:
                 self.centre.set_detected(name, track)
 
     def _lead(self, train: SimulatedTrain, before_m: float) -> None:
-        """Set the track of a train that runs onto points, and count violations."""
+        """Store the track to which points lead a train that runs onto them, and count violations."""
         for name in self.centre.state.points:
             near, _ = along(self.layout.zone_m(name), train.direction)
             if not train.direction * before_m < near <= train.direction * train.front_m:

@@ -37,7 +37,7 @@ async def run_train(
     integrity: Path | None = None,
     for_s: float | None = None,
 ) -> tuple[int, int]:
-    """Send the newest position every second, and write received authorities and changes of braking as JSON lines.
+    """Send the newest position every second; write received authorities, and starts and ends of braking, as JSON lines.
 
     The function returns the numbers of sent reports and of received authorities. After the last position, it ends when
     the last report is answered, or after `ANSWER_S`.

@@ -34,17 +34,17 @@ YEAR_S: Final = 31_557_600.0
 
 
 class TriangleVerdict(IntEnum):
-    """Verdict on a set of three fixes; every verdict from `ONE_RECEIVER` on stops the trains."""
+    """Verdict on a set of three fixes; `ONE_RECEIVER` and all higher values stop the trains."""
 
     #: Every fix is inside its circle, and every side within its limit.
     HEALTHY = 0
-    #: Every fix is inside its circle, but one side, or both sides at one receiver, exceed their limit: a warning.
+    #: Every fix is inside its circle, but one side, or both sides at one receiver, are above the limit: a warning.
     RECEIVER_DRIFTING = 1
     #: One fix is outside its circle, and both sides at this fix exceed their limit.
     ONE_RECEIVER = 2
     #: All fixes are outside their circles, and all sides within their limits, as after a satellite fault or jamming.
     SATELLITES_OR_JAMMING = 3
-    #: The fixes coincide, as after one false signal for all three receivers.
+    #: The fixes coincide, as if the three receivers tracked the same false signal.
     SPOOFING = 4
     #: Any other combination: the ground side cannot determine the cause.
     GROUND_LOST = 5
@@ -64,8 +64,8 @@ class TriangleLimits(Settings):
     #: Radius of the circle of allowable error. An error common to all receivers is not detected up to this size, and
     #: must be part of the error budget of the trains.
     radius_m: float = option("Radius of the circle of allowable error.", 12.0, name="--radius", metavar="M", gt=0)
-    #: Largest deviation of the vector between two fixes from the vector between their points.
-    side_m: float = option("Largest deviation of the vector between two fixes.", 6.0, name="--side", metavar="M", gt=0)
+    #: Limit of the sides: largest deviation of the vector between two fixes from the vector between their points.
+    side_m: float = option("Largest error of the vector between two fixes.", 6.0, name="--side", metavar="M", gt=0)
 
     @model_validator(mode="after")
     def _side_within_twice_the_radius(self) -> Self:
@@ -117,8 +117,8 @@ def limits_for_false_stops(
 class TriangleResult(FrozenArrays):
     """Comparison of T sets of fixes with the reference triangle."""
 
-    error_m: Floats  #: Horizontal distance of each fix from its point; NaN without a fix; shape (T, 3).
-    side_error_m: Floats  #: Deviation of the vector between two fixes, in the order of `SIDES`; shape (T, 3).
+    error_m: Floats  #: Horizontal distance of each fix from its known point; NaN without a fix; shape (T, 3).
+    side_error_m: Floats  #: Length of the deviation of the vector between two fixes, by side (`SIDES`); shape (T, 3).
     distance_error_m: Floats  #: Deviation of the distance between two fixes, shape (T, 3).
     bearing_error_deg: Floats  #: Deviation of the bearing between two fixes, clockwise, in [-180, 180); shape (T, 3).
     verdict: Codes  #: `TriangleVerdict`, shape (T,).
@@ -135,7 +135,7 @@ def compare_triangle(
     points_m : ndarray, shape (3, 2) [m]
         East and north coordinates of the known points, relative to any origin.
     fixes_m : ndarray, shape (T, 3, 2) [m]
-        Raw fixes from the same satellites at the same epoch, in the same frame; NaN for an absent fix.
+        Raw fixes in the frame of `points_m`, from the same satellites at each epoch; NaN for an absent fix.
     cn0_fallen : ndarray of bool, shape (T, 3), optional
         Whether the C/N0 of a receiver has fallen.
 
@@ -149,14 +149,14 @@ def compare_triangle(
     shortest = float(np.hypot(side[:, 0], side[:, 1]).min())
     if not shortest > 2.0 * limits.radius_m + limits.side_m:
         raise ValueError(
-            f"the shortest side of the triangle is {shortest:.1f} m; more than two radii and the limit of the sides "
-            f"({2.0 * limits.radius_m + limits.side_m:.1f} m) were expected"
+            f"the shortest side of the triangle is {shortest:.1f} m; more than two radii plus the limit of the sides, "
+            f"{2.0 * limits.radius_m + limits.side_m:.1f} m, was expected"
         )
     offset = fixes_m - points_m
     measured = fixes_m[:, second] - fixes_m[:, first]
     error, side_error = np.hypot(*np.moveaxis(offset, -1, 0)), np.hypot(*np.moveaxis(measured - side, -1, 0))
     apart = np.hypot(*np.moveaxis(measured, -1, 0))
-    # comparisons with NaN are False: an absent fix is neither inside its circle nor consistent
+    # comparisons with NaN are False: an absent fix is outside its circle, and its sides are above the limit
     inside, small = error <= limits.radius_m, side_error <= limits.side_m
     coincide = (apart <= limits.side_m).all(axis=1)
     fallen = np.zeros(error.shape, dtype=bool) if cn0_fallen is None else cn0_fallen
@@ -228,9 +228,9 @@ _SETTLE_S: Final = 10.0
 class MonitorLimits(Settings):
     """Times of the monitor."""
 
-    #: Time since the last three fixes after which the next three are late. The sum of this time and the period of the
-    #: fixes must not exceed the time to alert of 6 s.
-    late_s: float = option("Time after which three fixes are late.", 3.0, name="--late", metavar="S", gt=0, le=5.0)
+    #: Fixes count as late when this time has passed since the last complete set of three fixes. The sum of this time
+    #: and the period of the fixes must not exceed the time to alert of 6 s.
+    late_s: float = option("Longest time without all three fixes.", 3.0, name="--late", metavar="S", gt=0, le=5.0)
     healthy_s: float = Field(default=300.0, gt=0)  #: Time of uninterrupted healthy fixes before a stop can be released.
 
 
@@ -242,8 +242,8 @@ class MonitorState:
     cause: TriangleVerdict | None = None  #: Verdict that stopped the trains; None before the first stop.
     receiver: int = -1  #: Receiver that the cause names; -1 if the cause names none.
     since_s: float = 0.0  #: Time of the stop [s].
-    complete_s: float = 0.0  #: Time of the last set of three fixes [s].
-    #: Time since which all fixes have been healthy [s]; None if the newest fixes are not healthy.
+    complete_s: float = 0.0  #: Time of the last complete set of three fixes [s].
+    #: Time of the first of the healthy fixes without interruption [s]; None if the newest fixes are not healthy.
     healthy_since_s: float | None = None
 
 
@@ -308,7 +308,7 @@ def release(
         return state, (), "there is no stop to release"
     healthy = 0.0 if state.healthy_since_s is None else now_s - state.healthy_since_s
     if healthy < limits.healthy_s or now_s - state.complete_s > limits.late_s:
-        return state, (), f"healthy for {healthy:.0f} s of the {limits.healthy_s:.0f} s before a release"
+        return state, (), f"fixes are healthy for {healthy:.0f} s; a release requires {limits.healthy_s:.0f} s"
     return replace(state, stopped=False, cause=None, receiver=-1), (Order.RESUME,), None
 
 
@@ -352,15 +352,15 @@ class Monitor:
     begun: bool = False
 
     def begin(self, now_s: float) -> None:
-        """Begin at a clock time [s]; the first fixes are late `MonitorLimits.late_s` after this time."""
+        """Begin at a clock time [s]; the first fixes must arrive within `MonitorLimits.late_s` after this time."""
         self.state, self.begun = replace(self.state, complete_s=now_s), True
 
     def judge(self, fixes: StationFixes, now_s: float | None = None) -> MonitoredLog:
         """Process fixes at a clock time, by default at their time tags; return the verdicts and the orders to be sent.
 
-        Trains are stopped if fixes are late, in logs as well as in streams. The cause stated with each order is the
-        cause known after all these fixes, because later fixes may make it more exact. Raise SettingsError if the sides
-        of the triangle are too short for the limits.
+        Trains are stopped if fixes are late, in logs as well as in streams. Each order is returned with the cause that
+        is known after the last fix, because later fixes may make it more exact. Raise SettingsError if the sides of the
+        triangle are too short for the limits.
         """
         triangle, orders = judge_fixes(fixes, self.limits), []
         seconds = fixes.time.astype("datetime64[ns]").astype(np.int64) / 1e9

@@ -36,9 +36,9 @@ SESSION_S: Final = 1800.0
 #: Number of wrong passwords from one address within `WRONG_S` after which further log-ins from this address are
 #: refused.
 MOST_WRONG: Final = 10
-#: Time for which a wrong password is counted [s].
+#: A wrong password is forgotten after this time [s].
 WRONG_S: Final = 60.0
-#: A connection without a complete request is ended after one to two times this time [s].
+#: A connection is ended if its request is incomplete after this time, or at the latest after twice this time [s].
 REQUEST_S: Final = 10.0
 #: Largest number of connections; further connections are refused.
 MOST_CONNECTIONS: Final = 500
@@ -203,7 +203,7 @@ def _answer(values: dict[str, Any], status: int = 200) -> JSONResponse:
 
 
 async def _values(request: Request) -> dict[str, Any] | None:
-    """Return the JSON object of a request; None if the request has no object of at most `_LONGEST_BODY` bytes.
+    """Return the JSON object of a request; None if the body is no JSON object, or exceeds `_LONGEST_BODY` bytes.
 
     The content type must be ``application/json``: a page of another site cannot send this type without a preflight
     request, which is refused.
@@ -226,8 +226,8 @@ async def _values(request: Request) -> dict[str, Any] | None:
 class _TimedProtocol(H11Protocol):
     """HTTP protocol that ends connections whose request is not complete in time, even if bytes still arrive.
 
-    At most `MOST_IDLE` connections of a peer wait for a request; each further connection ends the one that has waited
-    longest. A peer with many connections therefore blocks neither other peers nor its own next request.
+    At most `MOST_IDLE` connections of a peer wait for a request; of more connections, the oldest are closed. A peer
+    with many connections therefore blocks neither other peers nor its own next request.
     """
 
     waiting: ClassVar[dict[tuple[int, str], dict[_TimedProtocol, None]]] = {}

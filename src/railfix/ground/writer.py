@@ -65,8 +65,8 @@ def _carry_out(work: Callable[[], None], outcome: Future[None]) -> Future[None]:
 class Commits:
     """Commits of the centre, at most one at a time, and the alarm if the database fails.
 
-    `alarm` is the reason why the state cannot be written, otherwise None. While there is an alarm, no authority is
-    sent; orders to brake are still sent.
+    `alarm` is the reason why the state cannot be written, None if it can be written. While there is an alarm, no
+    authority is sent; orders to brake are still sent.
     """
 
     writer: ThreadWriter | None = None  #: Executor of the commits; with None, each commit is carried out at once.
@@ -90,13 +90,13 @@ class Commits:
         outcome, then, begun_s = self._open
         if not outcome.done():
             if now_s - begun_s > HANGS_S:
-                self.alarm = f"the database has not answered for {now_s - begun_s:.0f} s; nothing is granted"
+                self.alarm = f"the database has not answered for {now_s - begun_s:.0f} s; no authorities are sent"
             return
         self._open = None
         try:
             outcome.result()
         except DatabaseError as error:
-            self.alarm, self._failed_s = f"{error}; nothing is granted", now_s
+            self.alarm, self._failed_s = f"{error}; no authorities are sent", now_s
             return
         self.alarm = None
         then()

@@ -59,7 +59,7 @@ class Orbits(RowArrays):
     i_dot: Floats
     node: Floats  #: Longitude of the ascending node at toe [rad].
     node_rate: Floats  #: Rate of `node` [rad/s].
-    #: For BeiDou GEO, rotation rate of the Earth-fixed frame relative to the tilted frame at toe [rad/s]; otherwise 0.
+    #: Earth rotation rate for BeiDou GEO, whose tilted frame does not rotate with the Earth [rad/s]; otherwise 0.
     tilted_rate: Floats
 
     cuc: Floats
@@ -89,7 +89,7 @@ class Orbits(RowArrays):
             cos_i0=np.cos(records.i0),
             sin_i0=np.sin(records.i0),
             node=records.omega0 - rotation * records.toe_sow_s,
-            # The node of GEO records is in the inertial frame at toe; the Earth's rotation is applied at the end.
+            # GEO states are first computed in an inertial frame; the Earth's rotation is applied at the end.
             node_rate=records.omega_dot - np.where(geo, 0.0, rotation),
             tilted_rate=np.where(geo, rotation, 0.0),
             relativity=-2.0 * np.sqrt(gm) / SPEED_OF_LIGHT**2 * records.eccentricity * records.sqrt_a,
@@ -106,7 +106,7 @@ def is_beidou_geo(satellite: str) -> bool:
 
 
 def eccentric_anomaly(mean_anomaly: Floats, eccentricity: Floats) -> tuple[Floats, Floats, Floats]:
-    """Solve M = E - e sin E in three Newton steps; return E, sin E and cos E, exact to the last digit for e < 0.2."""
+    """Solve M = E - e sin E in three Newton steps; return E, sin E and cos E, exact to rounding for e < 0.2."""
     anomaly = mean_anomaly
     sine, cosine = np.sin(anomaly), np.cos(anomaly)
     for _ in range(2):
@@ -119,7 +119,7 @@ def eccentric_anomaly(mean_anomaly: Floats, eccentricity: Floats) -> tuple[Float
 
 
 def _rotate(sine: Floats, cosine: Floats, angle: Floats) -> tuple[Floats, Floats]:
-    """Add a small angle to an angle given by sine and cosine; exact to rounding for a small angle below 1e-3 rad."""
+    """Add an angle below 1e-3 rad to an angle given by its sine and cosine; exact to rounding."""
     square = angle * angle
     small_sine = angle * (1.0 - square / 6.0)
     small_cosine = 1.0 - square * (0.5 - square / 24.0)
@@ -129,9 +129,9 @@ def _rotate(sine: Floats, cosine: Floats, angle: Floats) -> tuple[Floats, Floats
 def kepler_state(orbits: Orbits, since_toe_s: Floats) -> tuple[Components, Components, Floats]:
     """Compute satellite states at times since toe, shape (n,) [s] (IS-GPS-200, tables 20-IV and 30-II).
 
-    Harmonic corrections of latitude and inclination are small angles (at most 1.3e-4 rad). Return position [m] and
-    velocity [m/s] in the Earth-fixed frame of the same time, and the relativistic clock correction F e sqrt(A) sin E
-    [s], which equals -2 r.v / c^2.
+    The harmonic corrections of the argument of latitude and the inclination are small angles (at most 1.3e-4 rad).
+    Return position [m] and velocity [m/s] in the Earth-fixed frame of the same time, and the relativistic clock
+    correction F e sqrt(A) sin E [s], which equals -2 r.v / c^2.
     """
     el, t = orbits, since_toe_s
     motion = el.motion + el.delta_n_dot * t
@@ -192,8 +192,8 @@ def _out_of_tilted_frame(
     return (x, y, z), (vx, vy, vz)
 
 
-STEP_S: Final = 60.0  #: Step of the integration [s]; the ICD states the accuracy for 60 s.
-_BLOCK: Final = 8192  #: Number of rows integrated at once, so that the arrays stay in the cache.
+STEP_S: Final = 60.0  #: Step of the integration [s]; the accuracy in the ICD is for a step of 60 s.
+_BLOCK: Final = 8192  #: Largest number of rows integrated at once, so that the arrays stay in the cache.
 
 
 def acceleration(position: Floats, velocity: Floats, luni_solar: Floats) -> Floats:
@@ -231,7 +231,7 @@ def runge_kutta(position: Floats, velocity: Floats, luni_solar: Floats, step_s: 
 class GlonassStates:
     """States of all GLONASS records at multiples of `STEP_S` from the reference time of each record."""
 
-    #: States, with the reference time in the middle column, shape (3, records, 2 steps + 1) [m, m/s].
+    #: Position [m] and velocity [m/s], shape (3, records, 2 * steps + 1); the middle column is the reference time.
     position: Floats
     velocity: Floats
     luni_solar: Floats  #: Acceleration due to Moon and Sun, shape (3, records) [m/s^2].
@@ -251,7 +251,7 @@ class GlonassStates:
         return cls(position, velocity, luni_solar)
 
     def state(self, row: Integers, since_toe_s: Floats) -> tuple[Floats, Floats]:
-        """Compute positions and velocities (3, n) of the records `row` at times since their reference times (n,) [s].
+        """Compute positions and velocities (3, n) of the rows `row` at `since_toe_s` (n,) after their reference times.
 
         The times are between -`reach_s` and `reach_s`.
         """
@@ -274,9 +274,9 @@ class GlonassStates:
 #: and within a micrometre for other satellites. In the first and last interval of a file, the error is up to 0.7 m for
 #: these two satellites, and 0.05 mm for others.
 POINTS: Final = 13
-#: An interval longer than this multiple of the usual interval is a gap; no states are computed in a gap.
+#: An interval between epochs longer than this multiple of the usual interval is a gap, in which states are NaN.
 _GAP: Final = 1.5
-_STATES: Final = 4096  #: Number of states computed at once, so that the arrays stay in the cache.
+_STATES: Final = 4096  #: Largest number of states computed at once, so that the arrays stay in the cache.
 
 
 def precise_clock_s(ephemeris: PreciseEphemeris, column: Indices, time: Datetimes, offset_s: Floats) -> Floats:
@@ -357,7 +357,7 @@ def _rotate_axes(angle: Floats, vector: Floats) -> tuple[Floats, Floats, Floats]
 
 
 def _lagrange_at_zero(nodes: Floats, node_products: Floats) -> tuple[Floats, Floats]:
-    """Compute the Lagrange weights, shape (P, n), for a polynomial's value and slope at 0, given its nodes."""
+    """Compute the Lagrange weights of the values at `nodes` for value and slope at 0, both of shape (P, n)."""
     points = len(nodes)
     start = (np.ones(nodes.shape[1]), np.zeros(nodes.shape[1]))
     before, after = [start], [start]

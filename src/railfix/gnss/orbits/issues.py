@@ -13,8 +13,8 @@ from railfix.gnss.navigation import KeplerRecords, Navigation
 from railfix.gnss.orbits.prepared_records import validity_s
 
 _MILLISECOND: Final = np.timedelta64(1, "ms")
-_ISSUES: Final = 1024  #: Number of distinct issues of data; Galileo has 10 bits, and other constellations have 8.
-#: Time span that a lookup key can hold [ms]: 278 years.
+_ISSUES: Final = 1024  #: Number of distinct issues of data (Galileo: 10 bits, others: 8 bits).
+#: Range of the times in a lookup key [ms]: 278 years.
 _ISSUE_SPAN: Final = np.int64(2**43)
 _ORIGIN: Final = np.datetime64("1980-01-06T00:00:00", "ns")
 

@@ -1,10 +1,10 @@
 """Select the navigation record of a satellite at an epoch; lookups and orbit elements are computed once and cached.
 
 The newest record transmitted before the epoch is selected. A record without a transmission time counts as transmitted
-half-way between its own and the previous record's reference time. If the newest record is not valid at the epoch, or if
-all records were transmitted after the epoch (a file that begins later than the log), the record with the nearest
-reference time is selected, provided that it is valid. A selected record that was not yet transmitted is flagged. Health
-is taken from the selected record, even if an older record is healthy.
+half-way between the previous record's reference time and its own. If the newest record is not valid at the epoch, or if
+all records were transmitted later (the file begins after the log), the record with the nearest reference time is
+selected if it is valid. A selected record that was not yet transmitted is flagged. Health is taken from the selected
+record, even if an older record is healthy.
 """
 
 from __future__ import annotations
@@ -23,30 +23,30 @@ from railfix.core.timescale import seconds, timedelta
 from railfix.gnss.navigation import KeplerRecords, Navigation
 from railfix.gnss.orbits.ephemerides import GlonassStates, Orbits
 
-#: Longest permitted time between an epoch and toe [s]. GPS and QZSS records are valid for half the broadcast fit
-#: interval, and at least for this time (IS-GPS-200, 20.3.4.4; QZSS broadcasts 2 h records every hour). Galileo does not
-#: broadcast data older than 4 h (Galileo OS SDD 1.3, 2.4.2). BeiDou (renewed every hour) and GLONASS (renewed every 30
-#: min) do not broadcast a validity; their limits are taken from RTKLIB 2.4.3 (MAXDTOE_CMP, MAXDTOE_GLO of rtklib.h).
+#: Longest permitted time between an epoch and toe [s]. For GPS and QZSS, half the broadcast fit interval if that is
+#: longer (IS-GPS-200, 20.3.4.4; QZSS broadcasts 2 h records every hour). Galileo does not broadcast data older than 4 h
+#: (Galileo OS SDD 1.3, 2.4.2). BeiDou (renewed every hour) and GLONASS (renewed every 30 min) do not broadcast a
+#: validity; their limits are taken from RTKLIB 2.4.3 (MAXDTOE_CMP, MAXDTOE_GLO of rtklib.h).
 VALIDITY_S: Final[Mapping[str, float]] = {"G": 7200.0, "J": 7200.0, "E": 14_400.0, "C": 21_600.0, "R": 1800.0}
 
-#: A transmission time outside the record's validity by more than this counts as wrong [s].
+#: A transmission time counts as unknown if it differs from toe by more than the validity plus this time [s].
 _EARLY_S: Final = 3600.0
-#: Time span that a lookup key can hold [ms]: 34 years, so that records of different years have different keys.
+#: Range of the times in a lookup key [ms]: 34 years.
 _SPAN: Final = np.int64(2**40)
 _MILLISECOND: Final = np.timedelta64(1, "ms")
 
 
 @dataclass(frozen=True)
 class Lookup:
-    """Records of all satellites in two lists for bisection, one sorted by time of availability, one by start of use."""
+    """Records of all satellites in two lists for bisection, sorted by availability and by reference time."""
 
-    number: Mapping[str, int]  #: Lookup number by satellite, or by satellite and message ("E01 INAV").
-    first: Integers  #: First record of each satellite in both lists, shape (satellites,).
-    #: Keys that combine satellite and time of availability [ms since `origin`], ascending, and the row of each key in
-    #: the record table; shape (n,).
+    number: Mapping[str, int]  #: Number of each satellite, or satellite and message ("E01 INAV"), in the keys.
+    first: Integers  #: Index of each number's first key in `sent_key` and in `toe_key`.
+    #: Keys of number and time of availability [ms since `origin`], ascending, and the row of each key in the record
+    #: table; shape (n,).
     sent_key: Integers
     sent_record: Integers
-    #: Keys of satellite and start of use (half-way from the previous record's toe to the record's toe), and rows; (n,).
+    #: Keys of number and time from which the record's toe is the nearest, and the row of each key; shape (n,).
     toe_key: Integers
     toe_record: Integers
 
@@ -120,16 +120,16 @@ def validity_s(records: KeplerRecords) -> Floats:
 
 #: Galileo: bits of data validity and signal health by band: E1-B, E5a, E5b (RINEX 3.05, A8; OS SIS ICD 5.1.9.3).
 GALILEO_HEALTH: Final[Mapping[str, int]] = {"1": 0b111, "5": 0b111_000, "7": 0b111_000_000}
-#: QZSS: bits of the health word that concern a signal (IS-QZSS-PNT-006, 4.1.2.3(4)): L1, L1C/A, L2C, L5, L1C, L1C/B
-#: from the most significant bit. Satellites with L1C/A have broadcast the value 1 (no L1C/B) since 2022.
+#: QZSS: bits of the health word that concern each signal (IS-QZSS-PNT-006, 4.1.2.3(4)). From the most significant bit,
+#: they are L1, L1C/A, L2C, L5, L1C, L1C/B. The word 1 (no L1C/B) is usual since 2022.
 QZSS_HEALTH: Final[Mapping[str, int]] = {
     "1C": 0b110_000, "1E": 0b100_001, "1S": 0b10, "1L": 0b10, "1X": 0b10,
     "2S": 0b1000, "2L": 0b1000, "2X": 0b1000, "5I": 0b100, "5Q": 0b100, "5X": 0b100,
 }  # fmt: skip
-#: Largest accuracy of a healthy record [m]. URA indices of 8 and more exceed this accuracy (15 means no prediction;
-#: IS-GPS-200, 20.3.3.3.1.3); the GPS performance standard calls such a signal marginal.
+#: A record with a larger URA or SISA counts as unhealthy [m]. This is so for URA indices from 8 (15 means no
+#: prediction; IS-GPS-200, 20.3.3.3.1.3); the GPS performance standard calls such a signal marginal.
 LARGEST_ACCURACY_M: Final = 48.0
-#: Columns of `KeplerRecords.inter_signal_s` by GPS and QZSS signal; the mean is used for combined data and pilot codes.
+#: Columns of `KeplerRecords.inter_signal_s` by GPS and QZSS signal; two columns (data and pilot) are averaged.
 _ISC: Final[Mapping[str, list[int]]] = {
     "1C": [0], "1E": [0], "2S": [1], "2L": [1], "2X": [1], "5I": [2], "5Q": [3], "5X": [2, 3],
     "1S": [4], "1L": [5], "1X": [4, 5],
@@ -137,16 +137,16 @@ _ISC: Final[Mapping[str, list[int]]] = {
 P_CODES: Final = ("2P", "2W", "2Y", "2D", "2N", "2M")  #: Signals of the P code, to which TGD refers.
 #: Bit of the CNAV health word by band.
 _CNAV_HEALTH: Final[Mapping[str, int]] = {"1": 0b100, "2": 0b010, "5": 0b001}
-_ANY: Final = -1  #: Mask of all bits.
+_ANY: Final = -1  #: Mask for signals without bits of their own: any set bit makes them unhealthy.
 
 
 def unhealthy(records: KeplerRecords, signal: str) -> Masks:
     """Return whether each record flags a signal as unhealthy, shape (n,).
 
     A signal is flagged by any of the six health bits in GPS LNAV, by the bits of this signal for QZSS and Galileo, by
-    the bit of its band in CNAV, and by SatH1 or HS for BeiDou. A signal is also unhealthy if a Galileo record predicts
-    no accuracy (SISA "NAPA", written as -1, marginal by OS SDD 1.3, 2.3.1.4), or if the accuracy of the record exceeds
-    `LARGEST_ACCURACY_M`.
+    the bit of its band in CNAV, and by SatH1 or HS for BeiDou. A signal is also unhealthy if the URA or SISA exceeds
+    `LARGEST_ACCURACY_M`, or if a Galileo SISA is "NAPA" (no prediction, written as -1), which OS SDD 1.3, 2.3.1.4 calls
+    marginal.
     """
     system = records.satellite.astype("<U1")
     bits = np.full(len(records), _ANY, dtype=np.int64)
@@ -169,8 +169,8 @@ def group_delay_s(records: KeplerRecords, signal: str, *, clock: ClockReference 
     QZSS     sigma (`ranges.second_codes.group_delay_sigma_m`), because LNAV has no ISC. CNAV and CNAV-2: TGD - ISC on
              L1 C/A, L2C, L5, L1C (IS-GPS-200, 30.3.3.3.1.1; IS-GPS-705, 20.3.3.3.1.2; IS-GPS-800, 3.5.3.9).
     Galileo  The clock of I/NAV refers to E1 and E5b, and the clock of F/NAV refers to E1 and E5a (OS SIS ICD 5.1.5).
-             The delay on E1 is the BGD of the clock's pair. E5a and E5b use both BGDs; F/NAV has only BGD E5a/E1, which
-             replaces BGD E5b/E1. The delay on E6 is not broadcast (NaN).
+             The delay on E1 is BGD E5b/E1 for I/NAV, and BGD E5a/E1 for F/NAV. The delays on E5a and E5b need both
+             BGDs; F/NAV lacks BGD E5b/E1, for which BGD E5a/E1 is used. The delay on E6 is not broadcast (NaN).
     BeiDou   The clock refers to B3I (B1I ICD 3.0, 5.2.4.10), on which the delay is 0. D1 and D2: TGD1 on B1I, TGD2 on
              B2I. CNV1 and CNV2: TGD_B1Cp and TGD_B2ap on the pilots, with ISC on the data signals (B1C and B2a ICD
              1.0, 7.6). CNV3: TGD_B2bI on B2b. On other signals, the delay is NaN.
@@ -247,17 +247,17 @@ def _has_message(records: KeplerRecords, *messages: str) -> Masks:
     return np.isin(records.message, messages)
 
 
-_CACHED_SETS: Final = 64  #: Number of channel sets cached per navigation.
+_CACHED_SETS: Final = 64  #: Largest number of channel sets cached per navigation.
 
 
 @dataclass(frozen=True)
 class ChannelRecords:
-    """Rows of the navigation records, group delays and health of a set of channels."""
+    """Lookup numbers of a set of channels, and group delay and health by signal and record."""
 
     #: Indices of the channels with Keplerian records, shape (K,), and of the GLONASS channels, shape (R,).
     kepler: Indices
     glonass: Indices
-    #: Lookup numbers of the preferred message (with the signal's clock and delay) and of the other; -1 if absent; (K,).
+    #: Lookup numbers of the preferred message and of the alternative message; -1 if absent; shape (K,).
     preferred: Integers
     other: Integers
 
@@ -328,7 +328,7 @@ def _rows(of_signal: Callable[[str], NDArray[np.generic]], codes: list[str], rec
     return np.array([of_signal(code) for code in codes], dtype=np.float64).reshape(len(codes), records)
 
 
-#: Messages with the group delays that are not in LNAV, D1, D2, I/NAV and F/NAV, by constellation and signal.
+#: Message with the group delay of each signal whose delay is not in LNAV, D1, D2, I/NAV or F/NAV.
 _MESSAGE_OF: Final = {
     **dict.fromkeys(("G2S", "G2L", "G2X", "G5I", "G5Q", "G5X", "J2S", "J2L", "J2X", "J5I", "J5Q", "J5X"), "CNAV"),
     **dict.fromkeys(("G1S", "G1L", "G1X", "J1S", "J1L", "J1X"), "CNV2"),
@@ -339,7 +339,7 @@ _MESSAGE_OF: Final = {
 
 
 def _labels(satellite: str, signal: str) -> tuple[str, str]:
-    """Return the preferred and the alternative lookup label; F/NAV clocks refer to E1/E5a, I/NAV clocks to E1/E5b."""
+    """Return a channel's preferred lookup label (with the signal's clock and delay) and alternative label."""
     if satellite[0] == "E":
         messages = ("FNAV", "INAV") if signal[:1] == "5" else ("INAV", "FNAV")
         return f"{satellite} {messages[0]}", f"{satellite} {messages[1]}"

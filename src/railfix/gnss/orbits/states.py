@@ -19,7 +19,7 @@ from railfix.gnss.orbits.prepared_records import ChannelRecords, PreparedRecords
 #: Chunks of fewer epochs are computed with all channels together, longer chunks channel by channel, with the same
 #: arithmetic on every element. Both single live epochs and complete logs are then fast.
 _SHORT: Final = 96
-_BLOCK: Final = 4096  #: Number of epochs of a channel computed at once, so that the arrays stay in the cache.
+_BLOCK: Final = 4096  #: Largest number of epochs of a channel computed at once, so that the arrays stay in the cache.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,17 +33,17 @@ class SatelliteStates:
     #: (`railfix.core.geodesy.range_with_rotation` does that); shape (T, M, 3).
     position_ecef_m: Floats
     velocity_ecef_mps: Floats  #: Derivative of `position_ecef_m` in the same frame, shape (T, M, 3).
-    clock_m: Floats  #: Satellite clock times c, with the relativistic correction and without group delay; (T, M).
-    #: Group delay of the channel's signal: corrected code = code + clock_m - group_delay_m - delays. NaN on signals
-    #: whose delay is not broadcast (`prepared_records.group_delay_s`); shape (T, M).
+    clock_m: Floats  #: Satellite clock offset in metres, with relativistic correction, without group delay; (T, M).
+    #: Group delay of the channel's signal: corrected code = code + clock_m - group_delay_m. NaN on signals whose delay
+    #: is not broadcast (`prepared_records.group_delay_s`); shape (T, M).
     group_delay_m: Floats
     age_s: Floats  #: Epoch minus toe of the record, 0 for a precise ephemeris; shape (T, M).
-    accuracy_m: Floats  #: Accuracy as broadcast; NaN for GLONASS and for a precise ephemeris; shape (T, M).
-    #: Row in the record table of the constellation, -1 without a record; set also where the record is too old or the
-    #: channel has no code; shape (T, M).
+    accuracy_m: Floats  #: Broadcast URA or SISA; NaN for GLONASS and for a precise ephemeris; shape (T, M).
+    #: Row in the record table of the constellation, even if the record is too old or the channel has no code; -1 if the
+    #: satellite has no record; shape (T, M).
     record: Integers
     no_record: Masks  #: Whether the satellite has no record, shape (T, M).
-    #: Whether the satellite has records, but no valid record at the epoch (only where there is a code); shape (T, M).
+    #: Whether the satellite has records, but none is valid at the epoch; False where there is no code; shape (T, M).
     too_old: Masks
     unhealthy: Masks  #: Whether the record used flags the signal as unhealthy, shape (T, M).
     #: Whether the record used was transmitted after the epoch, so that it is not available live; shape (T, M).
@@ -51,7 +51,7 @@ class SatelliteStates:
 
     @classmethod
     def empty(cls, shape: tuple[int, ...]) -> SatelliteStates:
-        """Return writable states without records."""
+        """Return writable states in which no satellite has a record."""
         position, velocity = np.full((2, *shape, 3), np.nan)
         clock, delay, age, accuracy = np.full((4, *shape), np.nan)
         too_old, unhealthy, future = np.zeros((3, *shape), dtype=bool)
@@ -74,8 +74,8 @@ def satellite_states(
 ) -> SatelliteStates:
     """Compute satellite states at the times of transmission ``time - code / c - dt_sv``.
 
-    The receiver clock error cancels in the time of transmission, because it affects time tag and code equally. The
-    result of an epoch and channel does not depend on other epochs and channels, to the last bit.
+    The receiver clock error cancels in the time of transmission, because it affects time tag and code equally. Results
+    are the same to the last bit, whatever other epochs and channels are computed together.
 
     Galileo channels on E5a use F/NAV records, and other Galileo channels use I/NAV records. Where no such record is
     valid at an epoch, a valid record of the other message is used, with the clock and group delay of that message.
@@ -89,12 +89,14 @@ def satellite_states(
         NaN where not observed.
     navigation : Navigation
         If `precise` is set, positions and clocks are taken from the precise ephemeris; health and group delays are
-        taken from the nearest broadcast record of any age. A satellite that one of the two lacks has no record.
+        taken from the nearest broadcast record of any age. Satellites absent from the precise ephemeris, or (except for
+        GLONASS) from the broadcast records, have no record.
     max_age_s : float, optional
         Limit on the time between epoch and toe, in addition to the validity of the records [s].
     record : ndarray of int, shape (T, M), optional
         Rows of `navigation.kepler` to use if corrections refer to one issue of data (`issue_records`); -1 to select as
-        usual. A satellite is also unhealthy if the record that is usually selected flags it. Ignored for GLONASS.
+        without `record`. The record that would be selected without `record` may also flag a satellite as unhealthy.
+        Ignored for GLONASS.
 
     Raises
     ------
@@ -175,7 +177,7 @@ def _fill_kepler(
 
 
 def _groups(rows: Integers, usable: Masks) -> Iterator[tuple[Any, Any, Integers]]:
-    """Yield channels, epochs and record rows to compute together: all of a short chunk, otherwise by channel."""
+    """Yield channels, epochs and record rows to compute together: a whole short chunk, or part of a channel."""
     if rows.shape[1] < _SHORT:
         k, t = np.nonzero(usable)
         if len(k):
@@ -250,7 +252,7 @@ def _fill_precise(
     absent = (column < 0) | (states.no_record.all(axis=0) & ~glonass)
     m, t = np.nonzero(observed.T & ~absent[:, None])
     travel = -code_m[t, m] / SPEED_OF_LIGHT
-    # As with broadcast clocks, the time of transmission is computed without the relativistic correction (below 0.4 us).
+    # As with broadcast clocks, the time of transmission omits the relativistic correction, which is below 0.4 us.
     clock = precise_clock_s(precise, column[m], time[t], travel)
     position, velocity, clock = precise_state(precise, column[m], time[t], travel - np.nan_to_num(clock))
     missing = np.isnan(position[0]) | np.isnan(clock)
