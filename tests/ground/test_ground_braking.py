@@ -125,7 +125,7 @@ def test_a_train_over_its_curve_is_braked_and_says_by_how_much_it_overruns() -> 
         == "40.0 m/s exceeds 8.4 m/s, the limit for 0.0 m/s at 1000 m; it would stop 1781 m beyond its authority"
     )
     train.note_position(1500.0, 60.0)
-    assert "60.0 m/s, above the 0.0 m/s" in (train.brake_reason(1.0) or "")
+    assert "60.0 m/s exceeds 0.0 m/s" in (train.brake_reason(1.0) or "")
     train = granted(1000.0)
     train.note_position(900.0, 8.3)
     assert train.brake_reason(1.0) is None

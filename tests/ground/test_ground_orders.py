@@ -610,7 +610,7 @@ def test_a_train_passes_to_another_centre_where_it_stands(desk: Desk, tmp_path: 
 def test_trains_are_divided_and_joined(desk: Desk) -> None:
     """80 m of train 2 go on in front; what stays behind is train 8, which never reports."""
     values = {"train": 2, "other": 8, "length_m": 80, "reason": "shunter"}
-    assert "is not stopped" in (desk.twice("divide-train", values) or "")
+    assert "has not been ordered to stop" in (desk.twice("divide-train", values) or "")
     desk.report(2, 2900.0)
     assert desk.orders["stop"]({"train": 2}) is None
     assert desk.twice("divide-train", values) is None

@@ -603,7 +603,7 @@ def test_a_train_that_nobody_answers_says_so(folder: Path) -> None:
     ("change", "words"),
     [
         (("track = 1", "track = 3"), "trains.0.track"),
-        (("front_m = 300", "front_m = 90"), "is not between the points of A (60 to 440 m): with its"),
+        (("front_m = 300", "front_m = 90"), "is not between the points of A (60 to 440 m): within its"),
         (('station = "A"', 'station = "X"'), "points of X (none, the stations are A, B, C)"),
         (("listen", "lisen"), "unknown setting lisen"),
         ((":", ";"), "HOST:PORT was expected"),
