@@ -589,7 +589,7 @@ def test_an_authority_that_ends_is_renewed_with_overlap(tmp_path: Path) -> None:
                 alarms = centre.alarms()
                 await train.stop()
             assert sorted(set(got)) == [7, 8]
-            assert any("the certificate of train-8 ends" in text for text in alarms)
+            assert any("the certificate of train-8 expires" in text for text in alarms)
             assert not any("train-7" in text for text in alarms)
             got.clear()
             await centre.stop()
