@@ -122,9 +122,9 @@ class PreciseEphemeris(NotebookTable):
     """Positions and clocks from SP3, E epochs by N satellites."""
 
     time: Datetimes  #: Epochs, converted to GPS time if necessary; shape (E,).
-    satellite: Strings  #: Name of the satellite, shape (N,).
-    position_ecef_m: Floats  #: Position; NaN where the file has none (0.000000), shape (E, N, 3).
-    clock_s: Floats  #: Clock offset; NaN where the file has none (999999.999999), shape (E, N).
+    satellite: Strings  #: Names of the satellites, shape (N,).
+    position_ecef_m: Floats  #: Satellite position; NaN where the file has none (0.000000), shape (E, N, 3).
+    clock_s: Floats  #: Satellite clock offset; NaN where the file has none (999999.999999), shape (E, N).
     source: str = ""  #: Names of the files.
     notes: tuple[str, ...] = ()  #: Notes on omitted records, with the reasons.
 

@@ -32,7 +32,7 @@ class ReferenceCurve:
 
     direction: int  #: Running direction: 1 toward rising chainage, -1 toward falling.
     running_s: Floats  #: Running time without the dwell times at stations, strictly rising; shape (N,).
-    chainage_m: Floats  #: Position of the train's front, strictly rising or, with direction -1, falling; shape (N,).
+    chainage_m: Floats  #: Chainage of the front end, strictly rising or, with direction -1, falling; shape (N,).
     stations_m: Floats  #: Stopping positions of the front, in the order of the run; shape (K,).
 
     def __post_init__(self) -> None:
@@ -100,13 +100,13 @@ class ReferenceCurve:
 class TrainState(Enum):
     """State of a train in the centre."""
 
-    #: No report with a position since the centre was started.
+    #: No accepted report since the centre was started.
     UNKNOWN = "unknown"
     #: Reports are accepted.
     TRACKED = "tracked"
-    #: No report for `lost_s`: the displayed position is simulated on the reference run curve.
+    #: No accepted report for `lost_s`: the displayed position is simulated on the reference run curve.
     SIMULATED = "simulated"
-    #: No report for `error_s`, or the simulated position has reached the end of the authority.
+    #: No accepted report for `error_s`, or the simulated position has reached the end of the authority.
     ERROR = "error"
 
 
@@ -144,7 +144,7 @@ class TrainRecord:
     retired: tuple[int, ...] = ()  #: Identifiers of earlier sessions, whose late messages are rejected.
     counted_s: float | None = None  #: Time on the centre's clock when the newest sequence number arrived [s].
     rejected: str | None = None  #: Reason why the newest report was rejected, None if it was accepted.
-    message: TrainMessage | None = None  #: Newest report with a position.
+    message: TrainMessage | None = None  #: Newest accepted report; None before the first.
     heard_s: float = 0.0  #: Time on the centre's clock (monotonic) when `message` arrived [s].
     measured_s: float = 0.0  #: Time on the centre's clock for which the position of `message` is valid [s].
     shown_m: float | None = None  #: Displayed position of the front end [m].
@@ -166,7 +166,7 @@ class Rejection(Enum):
     TOO_OLD = "position too old when it was sent, or its time is ahead of the train's clock; set the train's clock"
 
 
-#: Number of earlier sessions of the on-board unit whose identifiers are stored.
+#: Number of earlier sessions of the on-board unit whose identifiers are stored, to reject late reports.
 _RETIRED = 16
 
 

@@ -15,7 +15,7 @@ from railfix.ground.layout import Layout, PointName, overlap
 from railfix.ground.state import Interlocking, PointState, TrainInterval, with_train
 from railfix.ground.stops import OCCUPIED, close_section, pieces_of
 
-#: Largest distance between the intervals of trains that are joined [m].
+#: Trains are joined only if their intervals are at most this far apart [m].
 APART_M: Final = 50.0
 
 Changed = tuple[Interlocking, str | None]

@@ -22,7 +22,7 @@ from railfix.ground.web import Order
 
 #: Shortest and longest time after which the same person may confirm an order [s]; another person may confirm at once.
 AGAIN_S: Final = 3.0, 60.0
-#: Longest accepted text of the reason for an order [characters].
+#: Largest length of the reason for an order [characters]; longer reasons are refused.
 LONGEST_REASON: Final = 200
 Values = dict[str, Any]
 

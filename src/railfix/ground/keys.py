@@ -22,7 +22,7 @@ with needs_extra():
 
 VALID_DAYS: Final = 365  #: Validity of the certificates of the centre and of trains [days].
 AUTHORITY_DAYS: Final = 3650  #: Validity of the authority's certificate [days].
-WARNING_DAYS: Final = 30  #: Remaining validity below which an alarm is raised [days].
+WARNING_DAYS: Final = 30  #: Remaining validity of a certificate at which an alarm is raised [days].
 _ISSUER: Final = "railfix authority"
 _PEM: Final = serialization.Encoding.PEM
 

@@ -19,7 +19,7 @@ from railfix.ground.positions import Clock
 ROLLED_M: Final = 50.0
 #: Number of newest reports for which the time of sending is stored.
 REMEMBERED: Final = 600
-REPORT_S: Final = 1.0  #: Time between two reports.
+REPORT_S: Final = 1.0  #: Time between two reports [s].
 #: Upper limit of `fresh_s` [s]. An authority is rejected if the report that it answers is older than the newest report
 #: by more than this.
 LONGEST_FRESH_S: Final = 45.0

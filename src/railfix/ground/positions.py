@@ -12,7 +12,7 @@ from typing import Final, Literal
 from railfix.core.utc import gps_now_ns
 from railfix.io.train_message import MessageError, TrainMessage, from_json
 
-#: Longest accepted line [bytes].
+#: Longest accepted input line [bytes]; longer lines are cut, and then rejected.
 LONGEST_LINE: Final = 100_000
 #: Largest number of bytes in one read.
 _READ: Final = 1 << 16

@@ -44,14 +44,14 @@ MOST_OF_PEER: Final = 16
 MOST_HANDSHAKES: Final = 64
 #: Time after which a handshake in progress is ended if another handshake waits [s]; by then, the peer has given up.
 HANDSHAKE_S: Final = 5.0
-#: Assumed time within which a peer begins its handshake after a Retry [s].
+#: After a Retry, room for the peer's handshake is reserved for this time [s].
 INVITED_S: Final = 0.25
 #: Interval at which waiting first packets are checked [s].
 ASKING_S: Final = 0.01
 #: Size of the receive buffer for packets that arrive while the centre is busy. With a thousand trains, the default
 #: buffer overflows after 0.1 s. The system may allow less (Linux: net.core.rmem_max).
 RECEIVE_BYTES: Final = 1 << 22
-#: Number of packets of connected peers that are processed per packet of a handshake.
+#: Largest number of packets of connected peers that are processed per packet of a handshake.
 TURN: Final = 16
 #: Time after which a waiting packet of a connected peer is dropped, because the peer has sent a newer message [s].
 LATE_S: Final = 1.0
@@ -79,7 +79,7 @@ class Handshakes:
     """Handshakes in progress, limited in number so that each is completed before its peer gives up."""
 
     def __init__(self) -> None:
-        self._open: dict[LinkProtocol, tuple[str, float]] = {}  #: Peer's address, and time of the first packet [s].
+        self._open: dict[LinkProtocol, tuple[str, float]] = {}  #: Peer's address and time of its first packet [s].
         self._invited, self._since_s = 0, float("-inf")
 
     def invites(self, now_s: float) -> bool:

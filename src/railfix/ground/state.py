@@ -23,7 +23,7 @@ from railfix.ground.layout import PointName
 class InterlockingLimits(Settings):
     """Limits of the interlocking."""
 
-    #: Distance from the end of an authority to the obstacle, points or end of track that limit it, plus `overlap_m`.
+    #: An authority ends this distance plus `overlap_m` before the obstacle, points or end of track that limit it.
     margin_m: float = Field(default=20.0, ge=0)
     #: Distance kept free beyond the end of an authority for a train that passes the end at release speed. With 0, there
     #: is no release speed.

@@ -27,7 +27,7 @@ _META: Final = sql.MetaData()
 MOST_NOTES: Final = 10_000
 #: Largest number of log lines in the database.
 MOST_LINES: Final = 1_000_000
-#: Name of the document that identifies the process in charge.
+#: Name of the stored document that identifies the process in charge of the database.
 _IN_CHARGE: Final = "centre in charge"
 TRAINS: Final = sql.Table(
     "trains",

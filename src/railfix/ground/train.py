@@ -22,7 +22,7 @@ from railfix.io.train_message import MessageError, TrainMessage, encode
 LOOK_S = 0.1
 #: Longest wait for the answer to the last report, once there are no more positions [s].
 ANSWER_S: Final = 5.0
-#: Largest age of the file in which the integrity device states that the train is complete [s].
+#: The train counts as complete only if its integrity device has written "complete" within this time [s].
 INTEGRITY_S = 2.0
 
 

@@ -40,7 +40,7 @@ class TriangleVerdict(IntEnum):
     HEALTHY = 0
     #: Every fix is inside its circle, but one side, or both sides at one receiver, are above the limit: a warning.
     RECEIVER_DRIFTING = 1
-    #: One fix is outside its circle, and both sides at this fix exceed their limit.
+    #: One fix is outside its circle, and both sides at this fix, but not the third side, are above the limit.
     ONE_RECEIVER = 2
     #: All fixes are outside their circles, and all sides within their limits, as after a satellite fault or jamming.
     SATELLITES_OR_JAMMING = 3
@@ -119,8 +119,8 @@ class TriangleResult(FrozenArrays):
 
     error_m: Floats  #: Horizontal distance of each fix from its known point; NaN without a fix; shape (T, 3).
     side_error_m: Floats  #: Length of the deviation of the vector between two fixes, by side (`SIDES`); shape (T, 3).
-    distance_error_m: Floats  #: Deviation of the distance between two fixes, shape (T, 3).
-    bearing_error_deg: Floats  #: Deviation of the bearing between two fixes, clockwise, in [-180, 180); shape (T, 3).
+    distance_error_m: Floats  #: Distance between two fixes minus the known distance, by side (`SIDES`); shape (T, 3).
+    bearing_error_deg: Floats  #: Bearing between two fixes minus the known bearing, in [-180, 180); shape (T, 3).
     verdict: Codes  #: `TriangleVerdict`, shape (T,).
     receiver: Integers  #: Receiver that the verdict names, -1 if it names none; shape (T,).
 
@@ -239,11 +239,11 @@ class MonitorState:
     """State of the monitor."""
 
     stopped: bool = True  #: Whether trains are stopped; true at the start, and from a stop until its release.
-    cause: TriangleVerdict | None = None  #: Verdict that stopped the trains; None before the first stop.
+    cause: TriangleVerdict | None = None  #: Verdict that stopped the trains; None before a stop and after its release.
     receiver: int = -1  #: Receiver that the cause names; -1 if the cause names none.
-    since_s: float = 0.0  #: Time of the stop [s].
+    since_s: float = 0.0  #: Time of the last stop [s].
     complete_s: float = 0.0  #: Time of the last complete set of three fixes [s].
-    #: Time of the first of the healthy fixes without interruption [s]; None if the newest fixes are not healthy.
+    #: Start time of the present series of healthy fixes [s]; None if the newest fixes are not healthy.
     healthy_since_s: float | None = None
 
 

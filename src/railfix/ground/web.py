@@ -38,7 +38,7 @@ SESSION_S: Final = 1800.0
 MOST_WRONG: Final = 10
 #: A wrong password is forgotten after this time [s].
 WRONG_S: Final = 60.0
-#: A connection is ended if its request is incomplete after this time, or at the latest after twice this time [s].
+#: A connection with an incomplete request is ended after this time, at the latest after twice this time [s].
 REQUEST_S: Final = 10.0
 #: Largest number of connections; further connections are refused.
 MOST_CONNECTIONS: Final = 500

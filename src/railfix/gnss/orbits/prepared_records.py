@@ -42,11 +42,11 @@ class Lookup:
 
     number: Mapping[str, int]  #: Number of each satellite, or satellite and message ("E01 INAV"), in the keys.
     first: Integers  #: Index of each number's first key in `sent_key` and in `toe_key`.
-    #: Keys of number and time of availability [ms since `origin`], ascending, and the row of each key in the record
-    #: table; shape (n,).
+    #: Keys that combine `number` and the time of availability [ms since `origin`], ascending, and the row of each key
+    #: in the record table; shape (n,).
     sent_key: Integers
     sent_record: Integers
-    #: Keys of number and time from which the record's toe is the nearest, and the row of each key; shape (n,).
+    #: Keys of `number` and the time from which the record's toe is the nearest, and the row of each key; shape (n,).
     toe_key: Integers
     toe_record: Integers
 
@@ -121,7 +121,7 @@ def validity_s(records: KeplerRecords) -> Floats:
 #: Galileo: bits of data validity and signal health by band: E1-B, E5a, E5b (RINEX 3.05, A8; OS SIS ICD 5.1.9.3).
 GALILEO_HEALTH: Final[Mapping[str, int]] = {"1": 0b111, "5": 0b111_000, "7": 0b111_000_000}
 #: QZSS: bits of the health word that concern each signal (IS-QZSS-PNT-006, 4.1.2.3(4)). From the most significant bit,
-#: they are L1, L1C/A, L2C, L5, L1C, L1C/B. The word 1 (no L1C/B) is usual since 2022.
+#: they are L1, L1C/A, L2C, L5, L1C, L1C/B. Since 2022, satellites with L1C/A send the word 1 (no L1C/B).
 QZSS_HEALTH: Final[Mapping[str, int]] = {
     "1C": 0b110_000, "1E": 0b100_001, "1S": 0b10, "1L": 0b10, "1X": 0b10,
     "2S": 0b1000, "2L": 0b1000, "2X": 0b1000, "5I": 0b100, "5Q": 0b100, "5X": 0b100,
