@@ -212,7 +212,7 @@ class FrameReceiver:
         )
 
     def _late(self, frame: Frame, now_ns: int) -> bool:
-        """Return whether a frame exceeds the shortest delay by over `delay_s`; clocks need not be synchronised."""
+        """Return whether a frame's delay exceeds the shortest delay by over `delay_s`; the two clocks may differ."""
         took = now_ns - frame.time_ns
         if self._shortest_ns is None:
             self._shortest_ns = float(took)

@@ -79,7 +79,7 @@ class OnBoard:
     order: BrakeOrder | None = None  #: Order to brake that the train obeys, if any.
     authority: Authority | None = None  #: Newest authority.
     #: Position at which the train's safe front end would stop if the train braked now: the farther of the results for
-    #: the last two positions. With None, the train accepts no earlier end.
+    #: the last two positions. With None, the train does not accept an earlier end.
     stops_at_m: float | None = None
     answered_s: float | None = None  #: Time at which the newest answered report was sent; None before the first answer.
     #: Number of the newest report sent before the last change of ends, or before the train rolled back. Authorities

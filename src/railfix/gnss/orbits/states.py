@@ -177,7 +177,7 @@ def _fill_kepler(
 
 
 def _groups(rows: Integers, usable: Masks) -> Iterator[tuple[Any, Any, Integers]]:
-    """Yield channels, epochs and record rows to compute together: a whole short chunk, or part of a channel."""
+    """Yield channels, epochs and record rows to compute together: a short chunk, or epochs of one channel."""
     if rows.shape[1] < _SHORT:
         k, t = np.nonzero(usable)
         if len(k):
