@@ -17,11 +17,11 @@ from railfix.gnss.observations import Observations
 
 DUPLICATES: Final = "duplicate epochs"
 OUT_OF_ORDER: Final = "epochs out of order"
-#: The time tag of an epoch is taken as wrong if more than this number of the epochs before it in the file have later
-#: tags, or more than this number of the epochs after it have earlier tags.
+#: An epoch is rejected if more than this number of epochs earlier in the file have later time tags, or more than this
+#: number of epochs further down in the file have earlier time tags.
 MOST_PASSED: Final = 20
-_HELD: Final = 2 * MOST_PASSED  #: Number of epochs held back until later epochs are read.
-#: A time tag that is earlier or later than both neighbours by more than this is taken as wrong.
+_HELD: Final = 2 * MOST_PASSED  #: Number of last epochs that are held back until later epochs are read.
+#: An epoch is rejected if its time tag is more than this before, or more than this after, both neighbouring tags.
 _LONE: Final = np.timedelta64(3600, "s")
 _ARRAYS: Final = ("code_m", "phase_cycles", "doppler_hz", "cn0_dbhz", "loss_of_lock")
 
@@ -44,7 +44,7 @@ class EpochOrder:
         self._break = False
 
     def ordered(self, runs: Iterable[FileEpochs]) -> Iterator[Observations]:
-        """Yield the epochs in parts, in order of time. The last part has only the notes and counts of the log.
+        """Yield the epochs in parts, in order of time. The last part has no epochs, but the notes and counts.
 
         Raise InputFileError if a time tag is wrong and `broken_lines` is "stop".
         """
@@ -64,7 +64,7 @@ class EpochOrder:
         yield self._summary()
 
     def _rise(self, times: Iterable[Datetimes]) -> bool:
-        """Return whether the times of consecutive parts rise strictly and begin after the last time returned."""
+        """Return whether the times of all parts increase strictly, and are later than the last epoch returned."""
         time = np.concatenate([*(time[-1:] for time in self._times[-1:]), *times, np.empty(0, "datetime64[ns]")])
         return bool((np.diff(time) > np.timedelta64(0, "ns")).all())
 
@@ -82,8 +82,8 @@ class EpochOrder:
     def _sort(self, runs: Sequence[FileEpochs], *, final: bool) -> tuple[Observations, list[FileEpochs]]:
         """Sort and check the waiting epochs.
 
-        Return the epochs that are ready, since no epoch later in the file can precede them, and a list of the epochs
-        that must wait, one element per epoch.
+        Return the epochs that no epoch further down in the file can precede in time, and a list of the other epochs,
+        which must wait, one element per epoch.
         """
         paths, epochs, lines = zip(*runs, strict=True)
         joined, line = stack_parts(list(epochs)), np.concatenate(lines)
@@ -123,7 +123,7 @@ class EpochOrder:
         return self._times[-1][-1] if self._times else np.datetime64(np.iinfo(np.int64).min + 1, "ns")
 
     def _handed_on(self, time: Datetimes) -> Masks:
-        """Return whether each time tag occurs among the epochs returned so far."""
+        """Return, for each time tag, whether an epoch with this tag has already been returned."""
         if not self._times:
             return np.zeros(len(time), dtype=np.bool_)
         self._times = [np.concatenate(self._times)]
@@ -167,7 +167,7 @@ class EpochOrder:
 
 
 def take_epochs(observations: Observations, rows: Indices) -> Observations:
-    """Return the epochs `rows` in this order, without problems and counts."""
+    """Return the epochs with the indices `rows`, in the order of `rows`; problems and counts are left out."""
     arrays = (*_ARRAYS, "time", "break_before", "receiver_alarm", "front_end_gain")
     values = {name: getattr(observations, name)[rows] for name in arrays}
     return replace(observations, **values, problems=(), problem_count=0, skipped={})
@@ -185,7 +185,7 @@ def _passed(time: Datetimes) -> tuple[Integers, Integers]:
     """Return, for each epoch, how many preceding epochs have later tags, and how many following epochs have earlier
     tags.
 
-    Only the nearest 2 * `MOST_PASSED` epochs on each side are counted.
+    Only the nearest 2 * `MOST_PASSED` epochs on each side are compared.
     """
     reach = min(2 * MOST_PASSED, max(len(time) - 1, 0))
     passed_by, passes = np.zeros(len(time), dtype=np.int64), np.zeros(len(time), dtype=np.int64)
@@ -197,14 +197,16 @@ def _passed(time: Datetimes) -> tuple[Integers, Integers]:
 
 
 def _is_repeated(time: Datetimes) -> Masks:
-    """Return whether each time tag occurs earlier in the array."""
+    """Return, for each time tag, whether the same tag occurs earlier in the array."""
     repeated = np.ones(len(time), dtype=np.bool_)
     repeated[np.unique(time, return_index=True)[1]] = False
     return repeated
 
 
 def _is_lone(time: Datetimes) -> Masks:
-    """Return whether each time tag is over `_LONE` before or after both neighbours, if the neighbours are in order."""
+    """Return, for each time tag, whether it is more than `_LONE` before both neighbours or more than `_LONE` after
+    both; False if the neighbours are not in ascending order.
+    """
     lone = np.zeros(len(time), dtype=np.bool_)
     before, this, after = time[:-2], time[1:-1], time[2:]
     lone[1:-1] = (before < after) & ((this > after + _LONE) | (this < before - _LONE))
@@ -212,7 +214,7 @@ def _is_lone(time: Datetimes) -> Masks:
 
 
 def _merge(joined: Observations, order: Indices, repeated: Masks) -> Observations:
-    """Return the epochs `order`. Repeated epochs only fill absent values of the first epoch with the same time tag."""
+    """Return the epochs with indices `order`. Repeated epochs only add values that the first with the tag lacks."""
     ordered = take_epochs(joined, order)
     if not repeated.any():
         return ordered

@@ -22,7 +22,7 @@ POSITIONS: Final[tuple[FileKind, ...]] = ("table", "rtklib", "nmea", "novatel", 
 GDAL: Final[tuple[FileKind, ...]] = ("gpkg", "shp", "fgb", "gml", "dxf", "pbf")
 #: All kinds of track maps.
 MAPS: Final[tuple[FileKind, ...]] = ("table", "mate", "geojson", "kml", "gpx", "osm", "xml", "rdf", "ifc", *GDAL)
-#: Description of each kind for messages, with the option that accepts it.
+#: Description of each kind of file for messages; in brackets, the command-line option for such a file.
 KIND_WORDS: Final[dict[FileKind, str]] = {
     "observations": "a RINEX observation file (--front, --rear)", "navigation": "a RINEX navigation file (--nav)",
     "rinex": "a RINEX file of clocks or meteorology", "sp3": "an SP3 file of precise orbits (--sp3)",
@@ -35,7 +35,7 @@ KIND_WORDS: Final[dict[FileKind, str]] = {
     "shp": "a Shapefile", "fgb": "a FlatGeobuf file", "pbf": "an OpenStreetMap file (.pbf)", "toml": "a TOML file",
     "unknown": "no log, table or map of a known form",
 }  # fmt: skip
-#: First bytes of binary files.
+#: First bytes of each kind of binary file.
 _BINARY: Final[dict[FileKind, bytes]] = {
     "parquet": b"PAR1", "gpkg": b"SQLite format 3\0", "shp": b"\0\0\x27\n", "fgb": b"fgb\x03",
     "dxf": b"AutoCAD Binary DXF",
@@ -58,12 +58,12 @@ _TEXT: Final[dict[FileKind, re.Pattern[bytes]]] = {
     ),
 }
 _ROOT: Final = re.compile(rb"\s*(?:<[?!][^>]*>\s*|<!--.*?-->\s*)*<(?:[\w.-]+:)?(\w+)", re.DOTALL)
-#: Kinds of XML files by the name of the root element in lower case.
+#: Kind of XML file for each name of the root element in lower case.
 _ROOTS: Final[dict[str, FileKind]] = {
     "kml": "kml", "gpx": "gpx", "osm": "osm", "rdf": "rdf", "featurecollection": "gml",
 }  # fmt: skip
 _RINEX: Final[dict[str, FileKind]] = {"O": "observations", "B": "sbas", "M": "rinex", "C": "rinex"}
-#: Kind by the ending of the file name, used where the content fits no kind.
+#: Kind for each ending of a file name, used if the content fits no kind.
 _ENDINGS: Final[dict[str, FileKind]] = {
     ".csv": "table", ".pos": "rtklib", ".nmea": "nmea", ".gpx": "gpx", ".kml": "kml", ".osm": "osm", ".pbf": "pbf",
     ".geojson": "geojson", ".json": "geojson", ".xml": "xml", ".landxml": "xml", ".railml": "xml", ".ifc": "ifc",
@@ -122,7 +122,7 @@ def has_times(path: FilePath) -> bool:
 
 
 def _header_line(head: bytes) -> str:
-    """Return the first line that is neither blank nor a comment, or "" if all lines are."""
+    """Return the first line that is neither blank nor a comment, or "" if there is none."""
     coding = "utf-16" if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
     lines = head.decode(coding, "replace").splitlines()
     return next((line for line in lines if line.strip() and not line.startswith("#")), "")

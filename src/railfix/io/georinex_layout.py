@@ -91,7 +91,7 @@ def observations_from_xarray(data: xr.Dataset) -> Observations:
     ------
     ValueError
         The dataset has no observation types over ``time`` and ``sv``, its time system is unknown, or its times do not
-        rise.
+        increase strictly.
     """
     import xarray as xr
 

@@ -50,8 +50,8 @@ def read_observations(
     Parameters
     ----------
     path : path or sequence of path
-        RINEX observation files, receiver logs (UBX, SBF, RTCM 3; other messages are skipped) or EGNSS MATE tables
-        S_GNSS_SAT, plain or compressed. Several files must be of one kind, and are read in order of time.
+        RINEX observation files, receiver logs (UBX, SBF, RTCM 3) or EGNSS MATE tables S_GNSS_SAT, plain or compressed.
+        Other messages in a receiver log are skipped. Several files must be of one kind, and are read in order of time.
     broken_lines : {"stop", "count"}
         With "stop", a malformed RINEX line raises InputFileError. With "count", the values or epochs that the line
         affects are skipped and counted. Malformed messages in a receiver log are always skipped and counted.
@@ -60,11 +60,12 @@ def read_observations(
     start, end : datetime64 or str, optional
         Time span to read, GPS time; epochs at `end` or later are excluded.
     date : datetime64 or str, optional
-        Any time within half a week of the log. It is required for RTCM 3 logs without ephemerides, because RTCM 3
+        Date of the log, correct to half a week. It is required for RTCM 3 logs without ephemerides, because RTCM 3
         observations have no week number.
     reader : {"railfix", "georinex"}
         "georinex" reads RINEX files with georinex, an independent reader, for comparison. georinex is slower, and does
-        not count malformed lines. It ignores events, scale factors, and the indicators of bands other than 1 and 2.
+        not count malformed lines. It ignores events, scale factors, and loss-of-lock indicators of bands other than 1
+        and 2.
 
     Raises
     ------
@@ -129,9 +130,9 @@ def scan_observations(
 ) -> Iterator[Observations]:
     """Return an iterator over the observations of one receiver in pieces of at most `epochs` epochs.
 
-    The first piece is shorter. The arguments `broken_lines`, `systems`, `start`, `end` and `date` are as in
-    `read_observations`, with the same errors. `progress` is called with the fraction of the files that has been read.
-    With georinex, all files are read before the first piece is returned.
+    The first piece has fewer epochs, so that processing begins early. The arguments `broken_lines`, `systems`, `start`,
+    `end` and `date`, and the errors raised, are as in `read_observations`. `progress` is called with the fraction of
+    the files that has been read. With georinex, all files are read before the first piece is returned.
     """
     if reader not in get_args(Reader):
         raise ValueError(f"reader is {reader!r}, 'railfix' or 'georinex' was expected")
@@ -230,7 +231,7 @@ def _of_systems(run: Observations, letters: list[str] | None) -> Observations:
 def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop", date: Time = None) -> Navigation:
     """Read the navigation records in RINEX navigation files and receiver logs, in any combination.
 
-    Records that describe no plausible orbit of their constellation are rejected, counted and described in the notes.
+    Records whose orbit is implausible for their constellation are rejected, counted and described in the notes.
 
     Parameters
     ----------
@@ -239,7 +240,7 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop", date: T
         With "stop", a malformed record raises InputFileError. With "count", a malformed record is skipped, counted in
         `Navigation.skipped` and described in `Navigation.notes`.
     date : datetime64 or str, optional
-        Any time within half a week of the logs. It is required for RTCM 3 logs whose records have no full date.
+        Date of the logs, correct to half a week. It is required for RTCM 3 logs whose records have no full date.
 
     Raises
     ------
@@ -265,7 +266,7 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop", date: T
 
 
 def _join(parts: list[Navigation]) -> Navigation:
-    """Join the navigation data of several files. The first Klobuchar coefficients and first leap seconds are used."""
+    """Join navigation data. Klobuchar coefficients and leap seconds are taken from the first part that has them."""
     return Navigation(
         kepler=join_rows([part.kepler for part in parts]),
         glonass=join_rows([part.glonass for part in parts]),

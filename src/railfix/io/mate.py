@@ -29,7 +29,7 @@ _RESULT: Final = (
     "ALGORITHM_ID", "SENSOR_SET", "PARAMETER_SET", "OPERATING_DATE", "TRAIN_NUMBER", "TIMESTAMP_LOCAL", "TIMESTAMP_UTC",
     "STATUS",
 )  # fmt: skip
-#: Columns of the input tables, in the order of the schema.
+#: Columns of each input table, in the order of the schema.
 READ: Final[Mapping[str, tuple[str, ...]]] = {
     "S_GNSS_SAT": (
         "DEVICE_ID", *_STAMPS, "GPS_WEEK", "GPS_TOW", "SAT_ID", "SIGNAL_TYPE", "LOCK_TIME", "CN0", "PSEUDORANGE",
@@ -56,7 +56,7 @@ READ: Final[Mapping[str, tuple[str, ...]]] = {
         "CROSS_DISTANCE", "NORTH_LV95", "EAST_LV95", "LATITUDE_ETRS89", "LONGITUDE_ETRS89", *_VALID,
     ),
 }  # fmt: skip
-#: Columns of the output tables.
+#: Columns of each output table.
 WRITTEN: Final[Mapping[str, tuple[str, ...]]] = {
     "R_TRACK": (
         *_RESULT, "TRACK_ID", "MOVEMENT_DIRECTION", "ORIENTATION", "TRAVELLED_DISTANCE", "RELATIVE_DISTANCE", "SPEED",
@@ -115,7 +115,7 @@ def only_device(path: FilePath, table: pl.DataFrame) -> pl.DataFrame:
     return table
 
 
-#: RINEX code by constellation and Septentrio signal name (SBF reference guide, signal types).
+#: RINEX signal code for each Septentrio signal name of each constellation (SBF reference guide, signal types).
 _CODES: Final[Mapping[str, Mapping[str, str]]] = {
     "G": {"L1CA": "1C", "L1P": "1W", "L1PY": "1W", "L2P": "2W", "L2PY": "2W", "L2C": "2L", "L5": "5Q", "L1C": "1L"},
     "R": {"L1CA": "1C", "G1CA": "1C", "L1P": "1P", "L2CA": "2C", "G2CA": "2C", "L2P": "2P", "L3": "3Q"},
@@ -144,7 +144,7 @@ def signal_code(satellite: str | None, signal: str) -> str:
 
 
 def read_mate_observations(path: str) -> Observations:
-    """Read the observations in a table S_GNSS_SAT; of several antennas or devices, only the one with the most rows.
+    """Read the observations of a table S_GNSS_SAT, only of the antenna and device with the most rows.
 
     Raise InputFileError if the file is not such a table, or no row has a known satellite and signal.
     """
@@ -195,7 +195,7 @@ def _as_arrays(
         values[name][row, column] = table[source].cast(pl.Float64).fill_null(np.nan).to_numpy()
     time = times.astype("datetime64[ns]")
     lock = values.pop("lock_s")
-    # the lock time is in whole seconds, and increases with time while the phase is continuous
+    # a lock time (in whole seconds) that decreases means that the lock was lost
     lost = np.zeros(lock.shape, dtype=np.uint8)
     lost[1:] = lock[1:] < np.fmin(lock[:-1], lock[:-1] + seconds(np.diff(time))[:, None] - 1.0 + 1e-6)
     return Observations(

@@ -16,8 +16,8 @@ from railfix.core.files import FilePath, read_text
 
 _BLOCK: Final = 4096  #: Number of rows that are converted to columns at a time.
 _SEPARATORS: Final = (";", "\t", "|")  #: Column separators other than the comma.
-#: Column names that other programs often use in tables of positions and maps, by railfix's name of the column. Names
-#: are compared without regard to case and punctuation. A height without a unit is in metres.
+#: For each of these column names of railfix, the names that other programs often give to the column. Names are compared
+#: without regard to case and punctuation. A height without a unit is in metres.
 _USUAL: Final[dict[str, tuple[str, ...]]] = {
     "latitude_deg": ("lat", "latitude", "latdeg", "latitudedegrees", "gpslatitude"),
     "longitude_deg": ("lon", "long", "lng", "longitude", "londeg", "longitudedegrees", "gpslongitude"),
@@ -26,7 +26,7 @@ _USUAL: Final[dict[str, tuple[str, ...]]] = {
         "elevation", "ellipsoidalheight", "ellipsoidalheightm", "hae",
     ),
 }  # fmt: skip
-#: Unit that the ending of a column name denotes, for units that railfix does not use.
+#: Endings of column names that denote units in which railfix reads no column, and the names of these units.
 _OTHER_UNITS: Final = {
     "ft": "feet", "feet": "feet", "foot": "feet", "usft": "feet", "mm": "millimetres", "cm": "centimetres",
     "km": "kilometres", "rad": "radians", "gon": "gon", "yd": "yards",
@@ -41,11 +41,11 @@ class NamedColumns:
     #: ``# key: value`` comments above the header, keys in lower case; values of a repeated key are joined by "; ".
     metadata: dict[str, str]
 
-    header_line: int  #: Line number of the header, from 1.
-    line: Integers  #: Line number of each row, from 1; shape (n,).
-    cells: dict[str, pl.Series]  #: Cells of each column without surrounding blanks.
-    separator: str = ","  #: Column separator; if it is not a comma, numbers may have decimal commas.
-    #: Original names of columns that were renamed to railfix's names (`with_usual_names`).
+    header_line: int  #: Line number of the header line; the first line of the file is 1.
+    line: Integers  #: Line number of each row in the file, shape (n,).
+    cells: dict[str, pl.Series]  #: Cells of each column, without surrounding blanks.
+    separator: str = ","  #: Column separator; if it is not a comma, numbers may have a decimal comma.
+    #: For each column that `with_usual_names` has renamed, railfix's name and the name in the file.
     usual: dict[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -55,7 +55,7 @@ class NamedColumns:
         return name in self.cells
 
     def take(self, rows: Indices) -> NamedColumns:
-        """Return the table of the rows `rows`, in this order."""
+        """Return the table of the rows with the indices `rows`, in the order of `rows`."""
         return replace(self, line=self.line[rows], cells={name: cell[rows] for name, cell in self.cells.items()})
 
     def error(self, row: int, message: str) -> InputFileError:
@@ -73,8 +73,8 @@ class NamedColumns:
     def numbers(self, name: str, *, blank: float | None = None) -> Floats:
         """Parse a column as numbers, shape (n,); raise InputFileError for a cell that is not a finite number.
 
-        Without `blank`, an empty cell is an error. With `blank`, empty cells get this value, and cells with ``nan`` are
-        accepted. If `blank` is infinite, infinite cells are accepted, too.
+        Without `blank`, an empty cell is an error. With `blank`, empty cells are read as `blank`, and cells with
+        ``nan`` are accepted. If `blank` is infinite, infinite cells are accepted, too.
         """
         given = self.cells[name].str.len_bytes().to_numpy() > 0
         cells = self.cells[name].to_list()
@@ -106,7 +106,7 @@ def fails(parse: Callable[[Any], object], text: object) -> bool:
 
 
 def is_named(theirs: str, name: str) -> bool:
-    """Return whether the column name `theirs` is railfix's `name`, or a usual name for the same quantity and unit."""
+    """Return whether the column name `theirs` is railfix's `name`, or another program's usual name for this column."""
     plain = "".join(c for c in theirs.lower() if c.isalnum())
     return plain in _USUAL.get(name, ()) or theirs.lower() == name
 
@@ -114,7 +114,7 @@ def is_named(theirs: str, name: str) -> bool:
 def with_usual_names(table: NamedColumns, names: Iterable[str]) -> NamedColumns:
     """Return the table with usual column names ("Latitude", "lon", "alt") replaced by railfix's `names`.
 
-    Raise InputFileError if a column name denotes another unit ("height_ft").
+    Raise InputFileError if a column name denotes a unit other than railfix's ("height_ft").
     """
     cells, usual = dict(table.cells), {}
     for name in names:

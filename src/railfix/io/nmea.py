@@ -20,14 +20,14 @@ from railfix.core.timescale import SECONDS_PER_DAY, timedelta, utc_to_gpst
 from railfix.gnss.joined_observations import first_problems
 from railfix.io.position_log import PositionLog
 
-#: Names under which lines that are not errors are counted.
+#: Names of the counts of lines that are unusual but no errors.
 _OTHER_LINES, _UNCHECKED = (
     "lines skipped that are not NMEA 0183 sentences",
     "sentences without checksum",
 )
 #: A geoid separation of 0 is reported as doubtful if the geoid is at least this far from the ellipsoid [m].
 _GEOID_M: Final = 2.0
-#: RTKLIB quality (`position_log.PositionLog`) by GGA quality indicator (NMEA 0183 4.10, field 6); 0 if not listed.
+#: RTKLIB quality (`PositionLog.quality`) for each GGA quality indicator (NMEA 0183 4.10, field 6); 0 for others.
 QUALITY: Final = {1: 5, 2: 4, 3: 5, 4: 1, 5: 2, 9: 3}
 
 
@@ -36,10 +36,10 @@ class _Gga:
     """GGA sentence."""
 
     line: int
-    of_day_s: float  #: UTC time of day, NaN where blank.
+    of_day_s: float  #: UTC time of day, NaN if blank.
     quality: int  #: RTKLIB quality (`QUALITY`).
-    geodetic: tuple[float, float, float]  #: Latitude, longitude [deg], ellipsoidal height [m]; NaN where unknown.
-    separation_m: float  #: Height of the geoid above the ellipsoid, NaN where blank.
+    geodetic: tuple[float, float, float]  #: Latitude, longitude [deg] and ellipsoidal height [m]; NaN if unknown.
+    separation_m: float  #: Height of the geoid above the ellipsoid, NaN if blank.
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def read_nmea(path: FilePath, *, broken_lines: BrokenLines = "stop", date: np.da
         With "stop", a sentence with a wrong checksum or invalid fields raises InputFileError. With "count", the
         sentence is skipped and noted. A malformed last line is always skipped and noted.
     date : datetime64, optional
-        UTC date of the first GGA sentence, for logs without RMC and ZDA. `date` overrides the dates in the log.
+        UTC date of the first GGA sentence, for logs without RMC and ZDA. If the log has dates, `date` overrides them.
 
     Returns
     -------
@@ -210,8 +210,8 @@ _DATED: Final[dict[str, Callable[[int, list[str]], _Date | None]]] = {"RMC": _rm
 
 
 def _times(fixes: list[_Gga], dates: list[_Date], *, chained: bool) -> Datetimes:
-    """Compute the GPS time of each fix. The date is that of the preceding date sentence, or, if `chained`, the first
-    date plus one day for each midnight passed.
+    """Compute the GPS time of each fix. The date is taken from the preceding RMC or ZDA sentence, corrected at
+    midnight. If `chained`, it is the first date plus one day for each midnight since.
     """
     of_day = np.array([fix.of_day_s for fix in fixes])
     line = np.array([fix.line for fix in fixes])

@@ -21,14 +21,14 @@ from railfix.core.utc import gpst_to_utc
 from railfix.io.named_columns import NamedColumns, fails, parse_named_columns, with_usual_names
 
 SIGMA_COLUMNS: Final = ("sigma_north_m", "sigma_east_m", "sigma_up_m")  #: Columns of standard deviations in a CSV log.
-#: Columns of a CSV log. Times are GPS time, UTC, Unix time, or GPS week and seconds; positions are geodetic or ECEF.
+#: Columns of a CSV log. Times are in GPS time, UTC, Unix time, or GPS week and seconds; positions are geodetic or ECEF.
 CSV_COLUMNS: Final = (
     "time_gpst", "time_utc", "unix_s", "week", "tow_s", "latitude_deg", "longitude_deg", "height_m", "x_m", "y_m",
     "z_m", "quality", "ratio", *SIGMA_COLUMNS,
 )  # fmt: skip
-#: Further columns of a position table, available in `PositionLog.table`.
+#: Other columns that a position table may have; they are read from `PositionLog.table`.
 OTHER_COLUMNS: Final = ("antenna", "chainage_m", "speed_mps", "sigma_m", "source", "environment")
-#: Largest accepted Unix time [s], near the end of 2099; larger values are probably in milliseconds.
+#: Unix times above this (near the end of 2099) are rejected, because they are probably in milliseconds [s].
 _LAST_UNIX_S: Final = 4.1e9
 _GEODETIC: Final = ("latitude_deg", "longitude_deg", "height_m")
 _CARTESIAN: Final = ("x_m", "y_m", "z_m")
@@ -47,11 +47,11 @@ class PositionLog(NotebookTable):
     sigma_m: Floats  #: Standard deviations north, east, up, NaN where absent; shape (n, 3).
     line: Integers  #: Line number of each row in the file, shape (n,).
     notes: tuple[str, ...] = ()
-    ratio: Floats | None = None  #: Ratio of the ambiguity test, shape (n,); None if the log has no such column.
-    #: Latitude and longitude of all rows, shape (n, 2); None if all rows with a position have a height.
+    ratio: Floats | None = None  #: Ratio of the ambiguity test, shape (n,); None if the log has no ratios.
+    #: Latitude and longitude of all rows, shape (n, 2); None if `ecef_m` suffices, because all positions have heights.
     plan_deg: Floats | None = None
-    antennas: tuple[str, ...] = ()  #: Names in the column ``antenna``, empty without this column.
-    table: NamedColumns | None = None  #: All columns of a CSV or RTKLIB log, None for other logs.
+    antennas: tuple[str, ...] = ()  #: Names in the column ``antenna``; empty if there is no such column.
+    table: NamedColumns | None = None  #: All columns of a CSV or RTKLIB log; None for logs of other kinds.
 
     @property
     def geodetic(self) -> tuple[Floats, Floats, Floats]:
@@ -70,7 +70,7 @@ class PositionLog(NotebookTable):
         return bool((self.quality >= 0).any())
 
 
-#: Largest number of malformed lines in a log; a file with more is not accepted.
+#: A log with more than this number of malformed lines is rejected.
 _MOST_BROKEN: Final = 200
 Parsed = TypeVar("Parsed")
 
@@ -80,9 +80,9 @@ def skip_broken(
 ) -> tuple[Parsed, tuple[str, ...]]:
     """Parse the lines of a log; return the result, and a note on each skipped line.
 
-    With "count", malformed lines below the first line of data are skipped. With "stop", only an incomplete last line is
-    skipped, because a power cut may leave one. Raise InputFileError if any other line is malformed, or if there are
-    more than `_MOST_BROKEN` malformed lines.
+    With "count", malformed lines after the first line of data are skipped. With "stop", only an incomplete last line is
+    skipped, because a power cut may leave one. Raise InputFileError for a malformed line that is not skipped, or if
+    more than `_MOST_BROKEN` lines are malformed.
     """
     text = read_text(path)
     lines = text.splitlines()
@@ -112,7 +112,7 @@ def parse_csv_positions(lines: list[str], path: FilePath, columns: Mapping[str, 
 def positions_of_table(table: NamedColumns) -> PositionLog:
     """Return the positions in a table. It may lack the columns of heights, standard deviations, times and quality.
 
-    Raise InputFileError if the table has no position columns or no rows, or if a value is no number or out of range.
+    Raise InputFileError if the table has no position columns or no rows, or if a value is not a number or out of range.
     """
     path = table.path
     cartesian = all(name in table for name in _CARTESIAN)
@@ -169,7 +169,7 @@ def qualities_in_words(log: PositionLog) -> str:
 def column_names(pairs: Iterable[str]) -> dict[str, str]:
     """Parse strings ``NAME=COLUMN``; return a mapping from railfix's column names to the column names of the file.
 
-    Raise SettingsError for a string of another form.
+    Raise SettingsError for a string that does not have this form.
     """
     columns: dict[str, str] = {}
     for pair in pairs:
@@ -259,7 +259,7 @@ def _times(texts: list[str]) -> Datetimes:
 
 # --- RTKLIB ------------------------------------------------------------------
 
-#: railfix's column names by the column names of RTKLIB's solutions.
+#: railfix's name for each column name of RTKLIB's solutions.
 _OF_RTKLIB: Final = {
     "latitude": "latitude_deg", "longitude": "longitude_deg", "height": "height_m", "x-ecef": "x_m", "y-ecef": "y_m",
     "z-ecef": "z_m", "Q": "quality", "sdn": "sigma_north_m", "sde": "sigma_east_m", "sdu": "sigma_up_m",

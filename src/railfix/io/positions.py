@@ -22,7 +22,7 @@ from railfix.io.position_log import PositionLog, parse_csv_positions, parse_rtkl
 from railfix.io.receiver.log import read_receiver_positions
 from railfix.io.xml_lines import read_gpx_lines
 
-#: RTKLIB quality by a word in the NovAtel position type.
+#: RTKLIB quality for each word that a NovAtel position type may contain.
 _QUALITY: Final = {"INT": 1, "FLOAT": 2, "WAAS": 3, "SBAS": 3, "PSRDIFF": 4, "PPP": 6, "SINGLE": 5, "PSRSP": 5}
 
 
@@ -128,7 +128,7 @@ def read_positions(
         For an NMEA log without dates, the UTC date of the first position (see `railfix.io.nmea.read_nmea`). For a UBX
         log whose positions have no date, any time within half a week of the log.
     columns : mapping of str, optional
-        Column names of the file by railfix's column names, such as ``{"latitude_deg": "Lat"}``.
+        For each of railfix's column names, the column name in the file, such as ``{"latitude_deg": "Lat"}``.
     heights : {"needed", "optional"}
         With "needed", a file without any height raises InputFileError.
     antennas : {"one", "several"}
@@ -137,8 +137,8 @@ def read_positions(
     Returns
     -------
     PositionLog
-        All rows and columns of the file. If times go back, a note states this. The rows are then sorted by time if
-        every row has a time and no time goes back by more than one minute.
+        All rows and columns of the file. If times go back, a note states this. In this case, the rows are sorted by
+        time, provided that every row has a time and no time goes back by more than one minute.
 
     Raises
     ------

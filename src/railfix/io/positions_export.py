@@ -31,7 +31,7 @@ ATTRIBUTES: Final = (
     "protection_level_ground_m", "protection_status", "speed_mps", "track", "track_chainage_m", "track_probability",
 )  # fmt: skip
 COORDINATES: Final = ("longitude_deg", "latitude_deg", "height_m")
-#: Colour of each status, by the reliability of the position; "other" is used for statuses that are not listed.
+#: Colour of each status, chosen by the reliability of such positions; "other" is for statuses that are not listed.
 STATUS_COLOURS: Final[Mapping[str, str]] = {
     "ok": "#00805e",
     "tracking": "#00805e",
@@ -50,7 +50,7 @@ STATUS_COLOURS: Final[Mapping[str, str]] = {
     "spoofing_suspected": "#d55e00",
     "other": "#767676",
 }
-#: WGS 84 with ellipsoidal heights.
+#: Coordinate reference system of the written positions: WGS 84 with ellipsoidal heights.
 _CRS: Final = "EPSG:4979"
 _STYLED: Final = (".geojson", ".gpkg", ".parquet")
 

@@ -25,27 +25,27 @@ from railfix.io.position_log import PositionLog, numbers_or_nan, qualities_in_wo
 from railfix.io.positions import read_positions
 from railfix.io.sensor_tables import get_column, get_times, read_sensor_table
 
-#: Columns of a reference file, in this order.
+#: Columns of a reference file, in the order of the file.
 COLUMNS: Final = (
     "time_gpst", "antenna", "chainage_m", "x_m", "y_m", "z_m", "speed_mps", "sigma_m", "source", "environment",
 )  # fmt: skip
-SOURCES: Final = ("rtk", "bridged", "truth", "")  #: Sources of a reference position; blank if unknown.
-#: A CSV file that has these columns, but no column ``source``, is taken as ground truth from the simulator.
+SOURCES: Final = ("rtk", "bridged", "truth", "")  #: Accepted sources of a reference position; blank means unknown.
+#: A CSV file with all these columns, but no column ``source``, is taken as ground truth from the simulator.
 _OF_TRUTH: Final = ("antenna", "chainage_m", "kilometrage_m", "speed_mps")
-_FIX: Final = 1  #: RTKLIB's quality of a fixed solution.
+_FIX: Final = 1  #: RTKLIB quality number of a fixed solution.
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class AntennaReference(NotebookTable):
     """Reference positions of one antenna, R epochs."""
 
-    time: Datetimes  #: GPS time, strictly rising, shape (R,).
+    time: Datetimes  #: GPS time, strictly increasing, shape (R,).
     ecef_m: Floats  #: Position in ECEF, shape (R, 3).
-    chainage_m: Floats  #: Chainage, NaN where absent; shape (R,).
-    speed_mps: Floats  #: Speed along the line, positive toward rising chainage, NaN where absent; shape (R,).
-    sigma_m: Floats  #: Standard deviation along the track, NaN where absent; shape (R,).
+    chainage_m: Floats  #: Chainage; NaN where absent, shape (R,).
+    speed_mps: Floats  #: Speed along the line, positive toward rising chainage; NaN where absent, shape (R,).
+    sigma_m: Floats  #: Standard deviation of the position along the track; NaN where absent, shape (R,).
     source: Strings  #: Source of the position, one of `SOURCES`; shape (R,).
-    environment: Strings  #: Environment such as "open", blank where absent; shape (R,).
+    environment: Strings  #: Environment such as "open"; blank where absent, shape (R,).
 
     def __post_init__(self) -> None:
         epochs = len(self.time)
@@ -180,8 +180,7 @@ def reference_table(references: Mapping[str, AntennaReference]) -> pl.DataFrame:
     )
 
 
-#: Longest interval between rows [s]. A longer interval is a gap, in which values are unknown.
-LONGEST_STEP_S = 1.0
+LONGEST_STEP_S = 1.0  #: A longer interval between rows is a gap, in which values are unknown [s].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -190,11 +189,11 @@ class Pulses:
 
     path: str
     time: Datetimes
-    #: Count of pulses, or distance [m] if `kind` is "distance"; shape (P,). If `signed`, the count falls where the
+    #: Count of pulses, or distance [m] if `kind` is "distance"; shape (P,). If `signed`, the count decreases when the
     #: train runs backward.
     count: Floats
     kind: str  #: Source of the count: "count" (readings of a counter), "pulse" (single pulses) or "distance".
-    signed: bool  #: Whether a column ``direction`` or a falling count states the running direction.
+    signed: bool  #: Whether the running direction is known, from a column ``direction`` or because the count decreases.
 
     def at(self, time: Datetimes) -> Floats:
         """Interpolate the count linearly. Return NaN outside the table, and in gaps across which the count changes.
@@ -241,10 +240,10 @@ class Acceleration:
 def read_pulses(path: FilePath) -> Pulses:
     """Read a tachometer table (CSV or Parquet) with ``time_gpst`` and a count.
 
-    The count is in the column ``count`` (counter reading, which must not wrap and may fall when the train runs
-    backward), ``pulse`` (pulse number, as for `railfix run`) or ``distance_m`` (distance run). Without these columns,
-    each row is one pulse. A column ``direction`` (1 or -1) states the sign. Raise InputFileError if the file is not
-    such a table, the times do not rise, or a direction is neither 1 nor -1.
+    The count is in one of the columns ``count`` (counter reading; it must not wrap, and may decrease when the train
+    runs backward), ``pulse`` (pulse number, as in tables for `railfix run`) and ``distance_m`` (distance run). Without
+    these columns, each row is one pulse. A column ``direction`` has the running direction. Raise InputFileError if the
+    file is not such a table, the times do not increase strictly, or a direction is neither 1 nor -1.
     """
     table = read_sensor_table(path, "pulses")
     names = {"count": "count", "pulse": "pulse", "distance_m": "distance"}
@@ -265,8 +264,9 @@ def read_acceleration(path: FilePath) -> Acceleration:
     """Read a table (CSV or Parquet) of accelerations toward the front, with ``time_gpst`` and one column of values.
 
     ``specific_force_mps2`` (``force_forward_mps2`` in simulator tables) is measured by an accelerometer. It includes
-    gravity on gradients, which is removed with the map. ``acceleration_mps2`` is the train's acceleration without
-    gravity. Raise InputFileError if the table has none or several of these columns, or the times do not rise.
+    gravity on gradients, which is later removed by means of the map. ``acceleration_mps2`` is the train's acceleration
+    without gravity. Raise InputFileError if the table has none or several of these columns, or the times do not
+    increase strictly.
     """
     table = read_sensor_table(path, "acceleration")
     kinds = {

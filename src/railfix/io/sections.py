@@ -20,8 +20,8 @@ class Sections:
     """Environment of S sections of a line. The sections are in ascending order and do not overlap."""
 
     path: Path
-    from_m: Floats  #: Chainage of the start, shape (S,) [m].
-    to_m: Floats  #: Chainage of the end, shape (S,) [m]. Only the last section includes its end.
+    from_m: Floats  #: Chainage of the start of each section, shape (S,) [m].
+    to_m: Floats  #: Chainage of the end of each section, shape (S,) [m]. Only the last section includes its end.
     environment: tuple[str, ...]
 
     def at(self, chainage_m: Floats) -> Strings:
@@ -37,7 +37,7 @@ class Sections:
 def read_sections(path: Path) -> Sections:
     """Read the sections of a line from a CSV file with the columns ``from_m,to_m,environment``.
 
-    Raise InputFileError if a column is missing, or if a section has no length or environment or overlaps another.
+    Raise InputFileError if a column is missing, or if a section is empty, has no environment or overlaps another.
     """
     table = read_named_columns(path)
     for name in SECTION_COLUMNS:

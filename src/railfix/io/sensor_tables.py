@@ -17,7 +17,7 @@ from railfix.core.tables import reading_table
 from railfix.core.timescale import utc_to_gpst
 from railfix.io.mate import mate_table, only_device, read_mate
 
-#: Columns of each kind of table, without ``time_gpst``. Columns in brackets may be absent.
+#: Columns of each kind of table, apart from ``time_gpst``. Columns in brackets may be absent.
 COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
     "tachometer": ("pulse", "[direction]"),
     "inertial": (
@@ -32,20 +32,20 @@ COLUMNS: Final[Mapping[str, tuple[str, ...]]] = {
     "pulses": ("[count]", "[pulse]", "[distance_m]", "[direction]"),
     "acceleration": ("[specific_force_mps2]", "[force_forward_mps2]", "[acceleration_mps2]"),
 }  # fmt: skip
-#: Kinds of tables that may have rows with only a time, which mean that the sensor had no output.
+#: Kinds of tables that may have rows with only a time. Such a row means that the sensor had no output.
 _SILENT: Final = ("tachometer", "ranging", "balises")
 _TIMELESS: Final = ("ranging_units", "list of balises")  #: Kinds of tables without times.
-#: Kinds of tables that must have no empty values, strictly rising times and at least two rows.
+#: Kinds of tables that must have at least two rows, strictly increasing times and no empty values.
 _COMPLETE: Final = ("pulses", "acceleration")
-_NAMES: Final = ("unit", "balise", "track")  #: Text columns.
-_WHOLE: Final = ("pulse", "direction")  #: Integer columns.
+_NAMES: Final = ("unit", "balise", "track")  #: Columns that are read as text.
+_WHOLE: Final = ("pulse", "direction")  #: Columns that are read as integers.
 
 
 def read_sensor_table(path: FilePath, kind: str) -> pl.DataFrame:
     """Read a sensor table of a kind in `COLUMNS`. Times are in GPS time.
 
     Rows with only a time are dropped from the tables of `tachometer`, `ranging` and `balises`. Raise InputFileError if
-    the file is not such a table or has no rows, if times fall, or if a value is missing or wrong.
+    the file is not such a table or has no rows, if times decrease, or if a value is missing or wrong.
     """
     with reading_table(path, f"cannot be read as a table of the {kind} ({{}})"):
         if mate_table(path):
@@ -156,7 +156,7 @@ _MATE_COLUMNS: Final[dict[str, dict[str, str]]] = {
 def _read_mate_table(path: FilePath, kind: str) -> pl.DataFrame:
     """Read an EGNSS MATE table; return a table with the columns in `COLUMNS`.
 
-    Raise InputFileError if the table is of another kind, has several devices, or has forces without gravity.
+    Raise InputFileError if the table is of another kind, has several devices, or has forces compensated for gravity.
     """
     name = mate_table(path)
     expected = {"inertial": "S_IMU", "radar": "S_SPEEDOMETER", "balises": "S_BALISEREADER"}

@@ -15,11 +15,11 @@ from railfix.gnss.orbits.ephemerides import POINTS
 from railfix.gnss.plausible_records import plausible_radius
 from railfix.io.file_kind import wrong_kind
 
-#: Time systems that agree with GPS time to nanoseconds. SP3-a files name no time system; they are in GPS time.
+#: Time systems that agree with GPS time to nanoseconds. SP3-a files name no time system (""); they are in GPS time.
 _GPST: Final = ("GPS", "GAL", "QZS", "CCC", "")
-#: Functions that convert other time systems to GPS time, by the name of the time system in files.
+#: For the name of each other time system in SP3 files, the function that converts it to GPS time.
 _TO_GPST: Final = {"UTC": utc_to_gpst, "GLO": utc_to_gpst, "BDT": bdt_to_gpst, "BDS": bdt_to_gpst}
-_NO_CLOCK: Final = 999_999.0  #: Clock value that means unknown [us]; some programs write 0 instead.
+_NO_CLOCK: Final = 999_999.0  #: Clock value from which on a clock is unknown [us]; some programs write 0 instead.
 
 
 def read_sp3(paths: Paths) -> PreciseEphemeris:
@@ -98,7 +98,7 @@ def _states(path: FilePath) -> list[tuple[int, str, list[float]]]:
 
 
 def _satellite(text: str) -> str:
-    """Return the satellite name, such as ``G01``. SP3-a omits the GPS letter, and may have blanks instead of zeros.
+    """Return the satellite name, such as ``G01``. SP3-a omits the letter G, and may have blanks for leading zeros.
 
     Raise ValueError if the text has no number.
     """

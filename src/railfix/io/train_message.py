@@ -21,7 +21,7 @@ from railfix.core.messages import Message
 from railfix.core.settings import Model
 
 VERSION: Final = 1  #: Version of the message schema; messages of other versions are rejected.
-LONGEST: Final = 1024  #: Longest encoded message [bytes]; longer input is rejected without decoding.
+LONGEST: Final = 1024  #: Longest encoded message [bytes]; longer data are rejected without decoding.
 
 Unsigned = Annotated[int, Field(ge=0, lt=1 << 63)]
 Signed = Annotated[int, Field(ge=-(1 << 62), lt=1 << 62)]
@@ -31,8 +31,8 @@ class MessageStatus(IntEnum):
     """Reliability of a message's position."""
 
     POSITION = 0  #: Position that passed every check.
-    COASTING = 1  #: Position from sensors alone.
-    DOUBTFUL = 2  #: Position with a failed check, or with several possible tracks or positions.
+    COASTING = 1  #: Position of the filter at an epoch at which satellites alone give no position.
+    DOUBTFUL = 2  #: Position that failed a check, or one of several possible positions or tracks.
     NO_POSITION = 3  #: Observations were received, but no position was computed.
     NO_INPUT = 4  #: No input was received in this period.
     #: Satellite positioning is suspended by order of the trackside. railfix itself sends no such message.
@@ -66,8 +66,10 @@ class SuspectedInterference(IntEnum):
 class Unknown(IntFlag):
     """Unknown properties of the train."""
 
-    FACING = 1  #: Direction of the front end; `over_cm` and `under_cm` then hold in both directions.
-    FRONT_END = 2  #: Position of the front end; `chainage_cm` is then that of the train's reference point.
+    #: Direction of the front end. If unknown, `over_cm` and `under_cm` each hold on both sides of `chainage_cm`.
+    FACING = 1
+    #: Position of the front end. If unknown, `chainage_cm` is the chainage of the train's reference point.
+    FRONT_END = 2
     LENGTH = 4  #: Train length.
 
 
@@ -75,40 +77,41 @@ class TrainMessage(Message):
     """Position message of a train."""
 
     train: Unsigned  #: Train identity.
-    sequence: Unsigned  #: Message number, counted by the sender.
+    sequence: Unsigned  #: Number of the message, counted by the sender.
     time_ns: Unsigned  #: Time at which the position is valid, GPS time since 1980-01-06.
     sent_ns: Unsigned  #: Time of sending, measured by the sender's clock, GPS time since 1980-01-06.
     line: Unsigned  #: Identity of the line or track.
-    chainage_cm: Signed | None = None  #: Chainage of the train's front end; None without a position.
-    #: The front end is at most `under_cm` ahead of `chainage_cm`, and at most `over_cm` behind (SUBSET-026 3.6.4).
+    chainage_cm: Signed | None = None  #: Chainage of the train's front end; None if there is no position.
+    #: The front end is at most `under_cm` ahead of `chainage_cm`, and at most `over_cm` behind it (SUBSET-026 3.6.4).
     over_cm: Unsigned | None = None
     under_cm: Unsigned | None = None
-    speed_cmps: Signed | None = None  #: Speed, positive toward rising chainage; None where unknown.
-    speed_bound_cmps: Unsigned | None = None  #: Bound on the speed error.
-    #: Running direction: 1 toward rising chainage, -1 toward falling chainage, 0 where unknown.
+    speed_cmps: Signed | None = None  #: Speed, positive toward rising chainage; None if unknown.
+    speed_bound_cmps: Unsigned | None = None  #: Bound of the error of `speed_cmps`; None if the speed is unknown.
+    #: Running direction: 1 toward rising chainage, -1 toward falling chainage, 0 if unknown.
     direction: Annotated[int, Field(ge=-1, le=1)] = 0
-    facing: Annotated[int, Field(ge=-1, le=1)] = 0  #: Direction of the front end, coded as `direction`.
+    facing: Annotated[int, Field(ge=-1, le=1)] = 0  #: Direction to which the front end points, coded as `direction`.
     standstill: bool = False
     status: MessageStatus = MessageStatus.NO_POSITION
     sources: Source = Source(0)
     protection_level_cm: Unsigned | None = None
     #: Probability that the train is on `line`, in thousandths, rounded down.
     track_permille: Annotated[int, Field(ge=0, le=1000)] | None = None
-    length_cm: Unsigned = 0  #: Train length.
+    length_cm: Unsigned = 0  #: Length of the train; 0 if unknown.
     complete: bool = False  #: Whether the train's integrity is confirmed.
     sigma_cm: Unsigned | None = None  #: Standard deviation of the position along the line, rounded up.
     #: Number of the newest movement authority that the train has accepted. The message acknowledges this authority.
     authority: Unsigned | None = None
-    authority_end_cm: Signed | None = None  #: End of the train's movement authority, rounded away from the train.
-    interference: SuspectedInterference | None = None  #: Suspected interference; None if the train does not check it.
-    #: Safe front end and safe rear end: in the direction of `facing`, no part of the train is ahead of the safe front
-    #: end or behind the safe rear end. None without bounds, or where the front end or its direction is unknown.
+    #: Chainage of the end of the movement authority, rounded away from the train.
+    authority_end_cm: Signed | None = None
+    interference: SuspectedInterference | None = None  #: Suspected interference; None if this is not checked.
+    #: Chainages of the safe front end and safe rear end: in the direction of `facing`, no part of the train is ahead of
+    #: the safe front end or behind the safe rear end. None if bounds, front end or its direction are unknown.
     safe_front_cm: Signed | None = None
     safe_rear_cm: Signed | None = None
     unknown: Unknown = Unknown(0)  #: Train properties that the sender does not know.
     #: Random number drawn at each start of the on-board unit; `sequence` restarts at the same time.
     session: Annotated[int, Field(ge=0, lt=1 << 62)] | None = None
-    brake_order: Unsigned | None = None  #: Number of the brake order being executed, None without an order.
+    brake_order: Unsigned | None = None  #: Number of the brake order that is being executed; None if there is no order.
 
     @model_validator(mode="after")
     def _place_with_bounds(self) -> Self:
@@ -151,7 +154,7 @@ def encode(message: TrainMessage) -> bytes:
 
 
 def decode(data: bytes) -> TrainMessage:
-    """Decode CBOR; unknown keys are skipped. Raise MessageError if this is no valid message of this version."""
+    """Decode CBOR; unknown keys are skipped. Raise MessageError if `data` is not a valid message of `VERSION`."""
     cbor2 = cbor()
     if len(data) > LONGEST:
         raise MessageError(f"has {len(data)} bytes, at most {LONGEST} were expected")
@@ -226,7 +229,7 @@ def from_json(line: str) -> TrainMessage:
     return validate_message(TrainMessage, values)
 
 
-_LARGEST_LENGTH: Final = 32_766  #: Largest length value in packet 0; the next larger value means unknown.
+_LARGEST_LENGTH: Final = 32_766  #: Largest value of a length in packet 0; the next value means an unknown length.
 
 
 def etcs_report(message: TrainMessage, *, reference_cm: int, reference: int) -> dict[str, int]:

@@ -1,4 +1,4 @@
-"""Readers of lines of points in GPX (1.0, 1.1) and KML (2.2, with Google's gx:Track)."""
+"""Readers of tracks, routes and lines in GPX (1.0, 1.1) and KML (2.2, with Google's gx:Track)."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ Element = ElementTree.Element
 class XmlLine:
     """Line of a GPX or KML file, n points."""
 
-    fields: dict[str, str]  #: ``name``, blank if absent, and the KML ``ExtendedData``.
-    points: Floats  #: Longitude, latitude [deg] and height as written [m], NaN where missing; shape (n, 3).
-    geoid_m: Floats  #: GPX ``geoidheight``, NaN where missing; shape (n,).
-    time: tuple[str, ...]  #: UTC times as written, blank where missing; n strings.
+    fields: dict[str, str]  #: ``name`` of the line, blank if absent, and the ``ExtendedData`` of a KML line.
+    points: Floats  #: Longitude, latitude [deg] and height [m] as written; NaN where missing, shape (n, 3).
+    geoid_m: Floats  #: Geoid height of each point (GPX ``geoidheight``) [m]; NaN where missing, shape (n,).
+    time: tuple[str, ...]  #: UTC time of each point as written, n strings; blank where missing.
 
 
 def read_root(path: FilePath) -> Element:

@@ -25,9 +25,9 @@ from railfix.pipeline.processor import EpochProcessor
 
 P = ParamSpec("P")
 
-#: First object that the second channel sends, once it is ready for calls.
-_READY: Final = "ready"
-#: Arrays of `AntennaResult` that are compared for each processing stage; the stages are in the order of processing.
+_READY: Final = "ready"  #: First object that the second channel sends; it means that the channel is ready for calls.
+#: For each processing stage, the arrays of `AntennaResult` that are compared; the stages are in the order of
+#: processing.
 STAGES: Final[dict[str, tuple[str, ...]]] = {
     "corrected ranges": ("corrected_code_m", "sigma_m", "elevation_deg"),
     "screens and exclusion": ("reason",),
@@ -36,7 +36,7 @@ STAGES: Final[dict[str, tuple[str, ...]]] = {
 
 
 def digests(outputs: list[LiveOutput]) -> list[dict[str, str]]:
-    """Return for each output SHA-256 digests of the results of each stage, and the encoded message, in hexadecimal."""
+    """Return, for each output, the SHA-256 digest of each stage's results and the encoded message, in hexadecimal."""
     return [
         {
             **{
@@ -83,7 +83,7 @@ def _second_channel(
 
 
 def _in_both(method: Callable[Concatenate[TwoChannels, P], None]) -> Callable[Concatenate[TwoChannels, P], None]:
-    """Return a method that calls a method of the engine, and records the call so that the second channel repeats it."""
+    """Wrap a method of the engine, so that each call is also recorded, to be repeated by the second channel."""
 
     @wraps(method)
     def in_both(self: TwoChannels, /, *arguments: P.args, **keywords: P.kwargs) -> None:
@@ -101,14 +101,14 @@ class TwoChannels(LiveEngine):
 
     def __init__(self, processor: EpochProcessor, settings: LiveSettings, sensors: Sequence[str] = ()) -> None:
         super().__init__(processor, settings, sensors)
-        # calls that the next poll sends to the second channel
+        # calls that the next `poll` sends to the second channel
         self._calls: list[tuple[str, tuple[Any, ...], dict[str, Any]]] = []
         context = multiprocessing.get_context("spawn")
         self._connection, other = context.Pipe()
         self._process = context.Process(target=_second_channel, args=(other, processor, settings, sensors), daemon=True)
         self._process.start()
         other.close()
-        # Wait here, before any data arrive; a later wait would delay the data and the reaction to signals.
+        # Wait here, before any data arrive; a later wait would delay the data and the reaction to SIGINT and SIGTERM.
         if self._recv() != _READY:
             raise ChannelsDisagreeError("the second channel does not start; no message is sent")
 
@@ -142,7 +142,7 @@ class TwoChannels(LiveEngine):
             raise ChannelsDisagreeError("the second channel has ended; no message is sent") from None
 
     def close(self) -> None:
-        """Kill the second process; it has no data to be stored."""
+        """Kill the second process; nothing is lost, because it stores no data."""
         self._connection.close()
         self._process.kill()
         self._process.join(timeout=5.0)

@@ -39,8 +39,7 @@ from railfix.run.sensors import check_filter, load_balises, read_sensors, units_
 from railfix.run.sources import OpenedLine, open_line
 from railfix.run.tally import TABLES, make_tables
 
-#: Number of results that are collected in memory before they are written to the tables.
-_BLOCK = 600
+_BLOCK = 600  #: Number of results that are collected in memory before they are written to the files.
 
 
 class ResultTables:
@@ -78,8 +77,8 @@ class ResultTables:
         self._folder.__exit__(kind, error, trace)
 
 
-#: Longest distance from the reference location that an ETCS position report can express, minus a margin for the
-#: position uncertainty [m].
+#: A line that extends further than this from the reference location is rejected, because ETCS position reports cannot
+#: express longer distances [m]. The value has a margin for the position uncertainty.
 _REACH_OF_REFERENCE_M: Final = 300_000.0
 
 
@@ -261,7 +260,7 @@ def _close(outlet: Outlet[Any], log: SessionLog) -> None:
 
 
 def _prepare(inputs: LiveInputs, tables: SensorSamples) -> tuple[OpenedLine, EpochProcessor]:
-    """Read the files that are needed at the start; return the line, and an epoch processor with their data."""
+    """Read the files that are needed at the start; return the line, and an epoch processor with the files' data."""
     config = inputs.config
     if config.sbas and config.sbas != "stream":
         raise SettingsError(

@@ -42,8 +42,7 @@ from railfix.run.sensor_checks import SensorChecks
 from railfix.run.tally import AntennaTally, Tally
 from railfix.tracking import Kind
 
-#: Number of log lines that may wait for a slow terminal or disk.
-_WAITING: Final = 1000
+_WAITING: Final = 1000  #: Number of log lines that may wait for a slow terminal or disk.
 
 
 class _Terminal:
@@ -77,7 +76,7 @@ class _Behind(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Pass a record to the outlet, as a formatted line if there is a formatter."""
-        if self._line is None:  # the arguments may change before the record is written
+        if self._line is None:  # format now, because the arguments may change before the record is written
             record = copy.copy(record)
             record.msg, record.args = record.getMessage(), None
         self._outlet.send(record if self._line is None else self._line.format(record))
@@ -91,12 +90,12 @@ class _Rotating(logging.handlers.RotatingFileHandler):
         raise
 
 
-#: Pattern of the time that begins each line of a session's log.
+#: Pattern of the time with which each line of a session's log begins.
 _LINE: Final = re.compile(rb"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3} ")
 
 
 def check_log_file(path: Path) -> None:
-    """Raise OutputError if an existing file is not a session's log, because the new log is appended to the file."""
+    """Raise OutputError if a file exists but is not a session's log, because the new log would be appended to it."""
     try:
         with path.open("rb") as file:
             begin = file.read(64)
@@ -163,7 +162,7 @@ class SessionLog:
         self._terminal.close()
 
 
-#: Number of latest values from which the percentiles of processing times and intervals are computed.
+#: Percentiles of processing times and of intervals between messages are computed from this number of latest values.
 _LAST: Final = 1000
 
 
@@ -172,10 +171,10 @@ class Metrics:
     """Counts and processing times of a session."""
 
     messages: Counter[MessageStatus] = field(default_factory=Counter)
-    #: Number of epochs by outcome (`LiveEngine.counts`).
-    epochs: Mapping[str, int] = field(default_factory=dict)
-    skipped: Counter[str] = field(default_factory=Counter)  #: Number of unused bytes, messages and lines, by reason.
-    lost: Counter[str] = field(default_factory=Counter)  #: Number of times that a connection broke, by source.
+    epochs: Mapping[str, int] = field(default_factory=dict)  #: Number of epochs for each outcome (`LiveEngine.counts`).
+    #: Number of unused bytes, messages and lines for each reason.
+    skipped: Counter[str] = field(default_factory=Counter)
+    lost: Counter[str] = field(default_factory=Counter)  #: Number of times that the connection to each source broke.
     sinks: Sequence[Sink] = ()
     hangups: int = 0  #: Number of SIGHUP signals received.
     processing_s: deque[float] = field(default_factory=lambda: deque(maxlen=_LAST))  #: Processing time per output [s].
@@ -272,11 +271,9 @@ async def serve_metrics(metrics: Metrics, address: str) -> asyncio.Server:
         raise SettingsError(f"--metrics {address}: no server can be opened at this address ({error})") from None
 
 
-#: Time from the first position to the check of all sensors [ns].
-WATCHED_NS: Final = 600_000_000_000
-_RADAR_NS: Final = 60_000_000_000  #: Interval of the radar checks [ns].
-#: Minimum interval between the positions that are used in the check of all sensors [ns].
-_EVERY_NS: Final = 500_000_000
+WATCHED_NS: Final = 600_000_000_000  #: All sensors are checked once, this time after the first position [ns].
+_RADAR_NS: Final = 60_000_000_000  #: Interval between two checks of the radar [ns].
+_EVERY_NS: Final = 500_000_000  #: The check of all sensors uses positions that are at least this time apart [ns].
 #: Number of chunks of sensor samples that are merged into one block, to save memory.
 _PIECES: Final = 256
 _NEVER: Final = np.datetime64("NaT", "ns")
@@ -329,12 +326,12 @@ class SensorWatch:
     def _hear(self, sensed: Sensed) -> None:
         """Store samples for the check of the sensors.
 
-        After twice `WATCHED_NS`, the sensors are checked if there is a position, and the stored samples are dropped.
+        When samples cover twice `WATCHED_NS`, the sensors are checked if there is a position; then samples are dropped.
         """
         table = bool(sensed.until == FOREVER)
         if sensed.samples and not self._judged:
             self._samples.append(sensed.samples)
-            if len(self._samples) == _PIECES:  # a chunk with a single row takes as much memory as a hundred rows
+            if len(self._samples) == _PIECES:  # merge, because a chunk of one row takes as much memory as a hundred
                 self._blocks.append(_join(self._samples))
                 self._samples = []
             self._begin = np.fmin(self._begin, sensed.until)
@@ -396,9 +393,9 @@ def _join(parts: list[SensorSamples]) -> SensorSamples:
 
 
 class PlaceWatch:
-    """Check that 3-D positions lie on the line, once an antenna has `ENOUGH_TO_STOP` positions.
+    """Check, as soon as an antenna has `ENOUGH_TO_STOP` positions, whether 3-D positions lie on the line.
 
-    If the positions do not lie on the line, `say` is called with the error message with which `railfix run` would end.
+    If the positions do not lie on the line, `say` is called with the error message of `railfix run` for this case.
     """
 
     def __init__(self, say: Callable[[str], None]) -> None:

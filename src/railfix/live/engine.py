@@ -32,12 +32,10 @@ from railfix.pipeline.received import merge_navigation
 from railfix.pipeline.results import Result
 from railfix.ranges.sbas import SbasMessages
 
-#: Time later than any epoch [ns].
-END_NS: Final = 1 << 62
-#: Largest number of waiting epochs of one antenna; more would wait only if the receivers' clocks differ.
+END_NS: Final = 1 << 62  #: Time later than any epoch [ns].
+#: If more than this number of epochs of one antenna wait, because the receivers' clocks differ, the oldest is dropped.
 _LONGEST_QUEUE = 100
-#: Distance travelled between two checks of the order of the antennas [m].
-_ORDER_STEP_M = 10.0
+_ORDER_STEP_M = 10.0  #: The order of the antennas is checked again each time the train has run this distance [m].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,9 +44,9 @@ class LiveOutput:
 
     message: TrainMessage
     result: Result | None
-    place: TrainPlace | None = None  #: Position reported by the message; None in a period without input.
-    #: Parts to be sent: the message and the rows of the result ("both"), only the rows if the message is delayed or
-    #: omitted ("rows"), or only a delayed message ("message").
+    place: TrainPlace | None = None  #: Position that the message reports; None in a period without input.
+    #: Parts to be sent: the message and the rows of the result ("both"), only the rows because the message is delayed
+    #: or omitted ("rows"), or only a delayed message ("message").
     part: Literal["both", "rows", "message"] = "both"
 
 
@@ -58,10 +56,10 @@ class EngineState:
 
     state: State
     done_ns: int  #: Time tag of the last epoch, GPS time since 1980 [ns]; 0 before the first epoch.
-    last_tag: Mapping[str, int]  #: Last time tag of each antenna [ns].
-    #: Sequence number of the last message, or a higher number that no message reaches before the next state is saved.
+    last_tag: Mapping[str, int]  #: Last time tag of each antenna, GPS time since 1980 [ns].
+    #: Sequence number from which a restarted session continues: at least the number of every message sent so far.
     sequence: int
-    #: Direction of the train's leading end along the chainage.
+    #: Direction of the train's leading end, and the state from which its changes are detected.
     running: RunningEnd = field(default_factory=lambda: RunningEnd(direction=0))
 
 
@@ -89,7 +87,7 @@ class _FromSatellites:
 
 @dataclass(frozen=True)
 class _Waiting:
-    """Epoch that waits for the other antenna or for sensors; `heard` is the number of earlier satellite items."""
+    """Waiting epoch; `heard` is the serial number of the last satellite item that arrived before the epoch."""
 
     epoch: Observations
     arrived_ns: int
@@ -193,7 +191,10 @@ class LiveEngine:
         self._due_ns = now_ns if self._due_ns is None else self._due_ns
 
     def export_state(self, *, reserved: int = 0) -> EngineState:
-        """Return the state for a restarted session, with `reserved` added to the sequence number in case of a crash."""
+        """Return the state for a restarted session.
+
+        `reserved` is added to the sequence number, so that after a crash no number is sent twice.
+        """
         sequence = self._sequence + reserved
         if self._saved is not None:  # no epoch has been received yet
             return replace(self._saved, sequence=sequence)
@@ -236,7 +237,7 @@ class LiveEngine:
         queue.append(waiting)
 
     def _resume_at(self, tag_ns: int, saved: EngineState) -> None:
-        """Use a saved state, or only its satellite data if the first new epoch precedes the state or is too late."""
+        """Use a saved state, or only its satellite data if the new epoch is earlier or over `state_age_s` later."""
         self._saved = None
         age_s = (tag_ns - saved.done_ns) / 1e9
         if 0.0 < age_s <= self.settings.state_age_s:
@@ -257,7 +258,7 @@ class LiveEngine:
         self._from_satellites.appendleft(_FromSatellites(heard=0, navigation=known))
 
     def _in_order(self, antenna: str, tag_ns: int) -> bool:
-        """Return whether to process an epoch; `restart_epochs` rising tags older than the last tag cause a restart."""
+        """Return whether to process an epoch; restart positioning after `restart_epochs` older epochs in sequence."""
         last = self._last_tag.get(antenna)
         if last is not None and tag_ns <= last:
             self.counts["duplicate" if tag_ns == last else "out of order"] += 1
@@ -287,15 +288,15 @@ class LiveEngine:
         self.reports.append("a receiver has restarted with older time tags; positioning restarts")
         self._state = None if self._state is None else State(received=self._state.received)
         self._done_ns = -1
-        self._samples = self._tables  # all samples of streams preceded the restart; tables may have later samples
+        self._samples = self._tables  # drop samples from streams, which preceded the restart, but keep tables
         for name in self._antennas:
             self._waiting[name].clear()
 
     def poll(self, *, now_ns: int, sent_ns: int | None = None) -> list[LiveOutput]:
-        """Return the outputs due: for complete pairs, epochs that waited long enough, or a period without input.
+        """Return the outputs that are due: one for each pair or long-waiting epoch, or one for a period without input.
 
         `now_ns` is read from the same clock as for `push`. If `sent_ns`, the GPS time of sending [ns], is given, one
-        message is sent per period, for the newest epoch. Otherwise, as for recorded epochs, every epoch has a message.
+        message is sent per period, for the newest epoch. Without `sent_ns`, as in a replay, every epoch has a message.
         At `END_NS` all waiting epochs are due, and no message without input is added.
         """
         outputs = [self._process_epochs(epochs) for epochs in self._pairs(now_ns)]

@@ -24,7 +24,7 @@ from railfix.pipeline.results import Result
 from railfix.run.tally import TABLES
 
 Form = Callable[[LiveOutput], bytes]
-#: Largest uncertainty that an ETCS position report can express, minus a margin for rounding [cm].
+#: No ETCS position report is made if the uncertainty is at least this, because reports cannot express it [cm].
 _LONGEST_DOUBT_CM: Final = 32_700_000
 
 
@@ -119,12 +119,12 @@ def _rows_form(table_of: Callable[[Result], pl.DataFrame | None]) -> Form:
     return rows_bytes
 
 
-#: Forms that encode the rows of `TABLES`.
+#: Form that encodes the rows of each table in `TABLES`.
 ROW_FORMS: Final = {name: _rows_form(table_of) for name, table_of in TABLES.items()}
 
 
 def _json_rows(table: pl.DataFrame) -> bytes:
-    """Return the rows as JSON lines, numbers with all digits; NaN becomes null, infinities "inf" and "-inf"."""
+    """Return the rows as JSON lines. Numbers have all digits; NaN is null, and infinities are "inf" and "-inf"."""
     texts = table.with_columns(pl.col(pl.Datetime).dt.strftime("%Y-%m-%dT%H:%M:%S%.9f"))
     lines = []
     for row in texts.iter_rows(named=True):

@@ -20,9 +20,9 @@ from railfix.pipeline.results import AntennaResult, Result
 from railfix.pipeline.sensed_motion import CARRIED
 from railfix.tracking import Kind, TrackStatus
 
-#: K factor of the speed bound: an error exceeds K sigma with a probability of 1e-7 (two-sided, as in P1 2.4).
+#: The speed bound is this number of sigmas, which errors exceed with a probability of 1e-7 (two-sided, as in P1 2.4).
 _SPEED_K = 5.33
-#: Amount by which bounds are increased because chainages are rounded to centimetres [m].
+#: Amount that is added to bounds, because chainages are rounded to centimetres [m].
 _ROUNDING_M: Final = 0.01
 _SOURCE_OF_KIND = {
     Kind.PHASE: Source.CARRIER_PHASE, Kind.DOPPLER: Source.DOPPLER, Kind.WHEEL: Source.TACHOMETER,
@@ -54,10 +54,10 @@ class TrainPlace:
     antenna: str  #: Antenna from which the position is computed.
     chainage_m: float  #: Chainage of the reference point [m]; NaN without a position.
     sigma_m: float  #: Standard deviation of the position along the track [m]; NaN if unknown.
-    bound_m: float  #: Bound of the position error [m]; infinite if there is none.
-    level_m: float  #: Protection level on which the bound is based [m]; infinite if there is none.
+    bound_m: float  #: Bound of the error of `chainage_m` [m]; infinite if there is none.
+    level_m: float  #: Protection level from which `bound_m` is computed [m]; infinite if there is none.
     status: MessageStatus
-    moving: int  #: Direction of motion, 1 toward rising chainage, -1 toward falling, 0 if too slow or unknown.
+    moving: int  #: Direction of motion: 1 toward rising chainage, -1 toward falling, 0 if unknown or too slow.
     #: Latitude, longitude [deg] and ellipsoidal height [m] of the first antenna; None without a position.
     geodetic: tuple[float, float, float] | None
 
@@ -65,9 +65,9 @@ class TrainPlace:
 def locate_train(result: Result, frame: TrainFrame) -> TrainPlace:
     """Return the position of the train's reference point, from the antenna with the lowest protection level.
 
-    The filter's along-track position is used if there is one, otherwise the single-epoch position. The bound is the
-    filter's over- and under-reading amount if the filter has a protection level (`tracking.level`). Otherwise, the
-    bound is the single-epoch protection level plus the distance between the positions of filter and single epoch.
+    The filter's along-track position is used if there is one, otherwise the single-epoch position. If the filter has a
+    protection level (`tracking.level`), the bound is the filter's over- and under-reading amount. Otherwise, the bound
+    is the single-epoch protection level plus the distance between the filter's position and the single-epoch position.
     """
     places = [_locate_antenna(name, result, frame) for name in result.antennas]
     return min(places, key=lambda place: (math.isnan(place.chainage_m), place.level_m))
@@ -94,7 +94,7 @@ def _locate_antenna(name: str, result: Result, frame: TrainFrame) -> TrainPlace:
     bounded = math.isfinite(bound)
     if status is MessageStatus.POSITION and not bounded:
         status = MessageStatus.DOUBTFUL
-    # The bound of a single epoch that failed a check does not apply to the dead-reckoned position.
+    # If the epoch failed a check, its single-epoch bound does not apply to the dead-reckoned position.
     if status is MessageStatus.COASTING and not (bounded and (math.isfinite(amount) or _has_passed(antenna))):
         status = MessageStatus.DOUBTFUL
     if status not in (MessageStatus.POSITION, MessageStatus.COASTING):  # positions with other statuses have no bound

@@ -33,13 +33,11 @@ from railfix.live.stream import (
 )
 from railfix.ranges.sbas import from_receiver
 
-#: Number of received items that may wait to be processed; if more arrive, the sources are paused.
+#: Number of received items that may wait to be processed; while this number waits, the sources are paused.
 _LONGEST_QUEUE: Final = 64
-#: Period of the status line [s].
-_STATUS_S: Final = 0.5
+_STATUS_S: Final = 0.5  #: Least time between two updates of the status line [s].
 
-#: Name of the base station's source.
-BASE: Final = "base"
+BASE: Final = "base"  #: Key of the base station's source among the sources.
 
 _LOG: Final = logging.getLogger("railfix.live")
 _Queue = asyncio.Queue[tuple[str, ReceivedData | None] | Sensed]
@@ -51,11 +49,11 @@ class Hooks:
 
     observe: Callable[[LiveOutput], None] | None = None  #: Called with every output, after the sinks.
     sensed: Callable[[Sensed], None] | None = None  #: Called with each chunk of samples decoded from a sensor's source.
-    #: Called every `LiveSettings.state_every_s`, when no data wait, with the state from which a restarted session
-    #: continues.
+    #: Called every `LiveSettings.state_every_s`, at a time when no data wait, with the state from which a restarted
+    #: session continues.
     save: Callable[[SavedSession], None] | None = None
     show: Callable[[str], None] | None = None  #: Called twice a second with the text of the status line.
-    metrics: Metrics = field(default_factory=Metrics)  #: Metrics of the session, returned at its end.
+    metrics: Metrics = field(default_factory=Metrics)  #: Metrics, which `run_session` updates and returns.
 
 
 async def run_session(
@@ -94,8 +92,8 @@ async def run_session(
         A source cannot be opened, or breaks and is not opened again, or the first line of a sensor's stream is not the
         header of the sensor's table.
     OutputError
-        A sink of a replay cannot be written. The error is raised after all other sinks have been written, or at once if
-        no sink is left.
+        In a replay, a sink cannot be written. The error is raised after all other sinks have been written, or at once
+        if no sink is left.
     ChannelsDisagreeError
         The messages, or the results of a processing stage, of two channels differ.
     """
@@ -155,7 +153,7 @@ class _Session:
     saved: float = field(default_factory=time.monotonic)
     shown: float = 0.0
     reserved_from: int = 0
-    #: Errors of sinks that could not be written, by name of the sink.
+    #: For the name of each sink that could not be written, the error.
     ended: dict[str, OutputError] = field(default_factory=dict)
 
     async def process(self, queue: _Queue, pumps: list[asyncio.Task[None]], *, replay: bool) -> None:
@@ -167,8 +165,7 @@ class _Session:
             while read_to_ns.keys() - {BASE}:  # a base station's stream may have no end
                 for pump in pumps:
                     if pump.done() and queue.empty():
-                        # an error of a source ends the session after the items received before the error have been
-                        # processed
+                        # raise the error of a source, now that all items received before it have been processed
                         pump.result()
                 wait = None if replay else max(self.engine.wait_s(now_ns=time.monotonic_ns()), 0.001)
                 item = await next_arrival(queue, pumps, wait_s=wait)
@@ -188,7 +185,8 @@ class _Session:
                         tag_ns = self.take(name, received, None if replay else now)
                         read_to_ns[name] = max(read_to_ns[name], tag_ns)
                 if self.engine.lag.skipped and not queue.empty() and now < due:
-                    continue  # while epochs are skipped, do not wait for a second channel after each epoch
+                    # while epochs are skipped, do not poll after each, because a poll may wait for a second channel
+                    continue
                 due = now + round(5e8 * self.engine.settings.period_s)
                 # In a replay, the clock is the time tag up to which all files have been read, so that both epochs of a
                 # pair are available.
@@ -334,8 +332,8 @@ class _Session:
 
 
 class _Pace:
-    """Common pace of all replayed files: an epoch is due at its time since the earliest time tag of all files, divided
-    by the replay speed.
+    """Common pace of all replayed files: the time from the earliest tag of all files to an epoch's tag, divided by the
+    replay speed, is the time from the start of the replay until the epoch is due.
     """
 
     def __init__(self, speed: float, files: Sequence[str]) -> None:
@@ -377,8 +375,8 @@ class _InTurn:
     """
 
     def __init__(self, files: Sequence[str]) -> None:
-        #: Time tag of each file's waiting epoch, and whether it is an epoch of the train; None while the file is being
-        #: read.
+        #: For each file, the time tag of its waiting epoch and whether the epoch is the train's; None while the file is
+        #: being read.
         self._waiting: dict[str, tuple[np.datetime64, bool] | None] = dict.fromkeys(files)
 
     async def wait(self, name: str, tag: np.datetime64) -> None:

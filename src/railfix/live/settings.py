@@ -17,40 +17,38 @@ from railfix.run.output import Overwrite
 class LiveSettings(Settings):
     """Settings of live operation."""
 
-    #: Interval between messages (P1 2.1: 0.1 s).
-    period_s: float = Field(default=0.1, gt=0.0, le=60.0)
-    #: Longest wait for the other antenna's epoch of the same time, after one antenna's epoch has arrived.
+    period_s: float = Field(default=0.1, gt=0.0, le=60.0)  #: Interval between messages (P1 2.1: 0.1 s).
+    #: Longest time for which an antenna's epoch waits for the other antenna's epoch of the same time.
     pair_wait_s: float = Field(default=0.03, ge=0.0, le=10.0)
-    #: Longest wait of an epoch for samples of the on-board sensors; then the epoch is processed without the missing
-    #: samples.
+    #: Longest time for which an epoch waits for samples of the on-board sensors. After this time, the epoch is
+    #: processed without the missing samples.
     sensor_wait_s: float = Field(default=0.03, ge=0.0, le=10.0)
     no_input: Literal["send", "skip"] = "send"  #: Whether a message is sent in a period without input.
-    #: Number of consecutive epochs with time tags older than the last tag, after which a receiver counts as restarted.
+    #: A receiver counts as restarted after this number of consecutive epochs with tags older than its last tag.
     restart_epochs: int = Field(default=3, ge=1)
-    #: Whether a broken connection is opened again; otherwise the session ends when all sources have ended. The first
-    #: connection must always succeed.
+    #: Whether a broken connection is opened again. With "off", a source ends when the other end closes the connection;
+    #: other breaks end the session with an error. The first connection must always succeed.
     reconnect: Literal["on", "off"] = "on"
 
-    #: Wait before the first attempt to open a broken connection again; the wait doubles with every attempt.
+    #: Wait before the first attempt to open a broken connection again; the wait doubles with every further attempt.
     reconnect_first_s: float = Field(default=1.0, gt=0.0, le=600.0)
-    #: Longest wait before an attempt to open a broken connection again.
+    #: Longest wait between two attempts to open a broken connection again.
     reconnect_longest_s: float = Field(default=30.0, gt=0.0, le=3600.0)
-    #: A connection on which no byte arrives for this time is considered broken.
+    #: A connection on which no byte arrives for this time is treated as broken.
     silence_s: float = Field(default=30.0, gt=0.0, le=3600.0)
-    #: Interval at which the train's position (GGA) is sent to the base station's caster, as a virtual station requires;
-    #: with 0, the position is not sent.
+    #: Interval at which the train's position (GGA) is sent to the base station's caster, as a virtual reference station
+    #: requires; 0 means that the position is not sent.
     gga_s: float = Field(default=0.0, ge=0.0, le=3600.0)
-    #: File with certificates (PEM) that are trusted for casters over TLS, in addition to the certificates of the
-    #: system.
+    #: File with certificates (PEM) that are trusted for connections to casters over TLS, in addition to the system's.
     ntrip_certificates: Path | None = None
-    #: Number of messages that may wait for a slow target; further messages are dropped and counted.
+    #: Number of messages that may wait for a slow target; while so many wait, new messages are dropped and counted.
     waiting: int = Field(default=100, ge=1, le=100_000)
-    #: Excess of an epoch's delay over the shortest delay so far, above which epochs are skipped. The skipping is
-    #: logged. Recorded epochs are never skipped.
+    #: If the delay of epochs exceeds the shortest delay so far by more than this, epochs are skipped until the excess
+    #: is a quarter of this. The skipping is logged. Recorded epochs are never skipped.
     behind_s: float = Field(default=5.0, ge=0.5, le=3600.0)
     state_every_s: float = Field(default=5.0, gt=0.0, le=3600.0)  #: Interval at which the state file is written.
-    #: Longest time from the last epoch of a state file to the first new epoch. After a longer time, only the
-    #: ephemerides, SBAS messages and sequence number of the file are used.
+    #: If the first new epoch is later than this after the last epoch of a state file, only the ephemerides, SBAS
+    #: messages and sequence number of the file are used.
     state_age_s: float = Field(default=60.0, gt=0.0, le=3600.0)
     log_bytes: int = Field(default=1_000_000, ge=1000)  #: Size at which a log file is rotated [bytes].
     log_files: int = Field(default=5, ge=1, le=1000)  #: Number of rotated log files that are kept.
@@ -60,9 +58,9 @@ class LiveSettings(Settings):
     #: default is taken from the vehicle file. A train that has run 50 m in the other direction is assumed to have
     #: changed ends.
     facing: Literal[-1, 0, 1] | None = None
-    #: Distance by which the train's front end is ahead of the front antenna; by default computed from the vehicle file.
+    #: Distance from the front antenna forward to the train's front end; by default computed from the vehicle file.
     front_offset_m: float | None = Field(default=None, ge=0.0)
-    length_m: float | None = Field(default=None, gt=0.0)  #: Train length; by default from the vehicle file.
+    length_m: float | None = Field(default=None, gt=0.0)  #: Length of the train; by default from the vehicle file.
     #: Identity of the reference location of ETCS position reports (NID_LRBG).
     reference: int = Field(default=0, ge=0, lt=1 << 24)
     reference_m: float = 0.0  #: Chainage of the reference location of ETCS position reports.
@@ -74,7 +72,7 @@ SENSORS: tuple[Sensor, ...] = ("tachometer", "inertial", "radar", "ranging", "ba
 
 
 class LiveInputs(Settings):
-    """Inputs of a live session, the options of ``railfix live``."""
+    """Inputs of a live session, given by the options of ``railfix live``."""
 
     front: str = input_option(
         "Source of the front antenna's receiver data: a file, tcp://HOST:PORT, serial:DEVICE?baud=115200, "

@@ -31,16 +31,15 @@ from railfix.live.sources import hidden
 
 Item = TypeVar("Item")
 
-#: Longest wait for the last items when an outlet is closed [s].
-_CLOSE_S = 5.0
+_CLOSE_S = 5.0  #: When an outlet is closed, items that its target has not taken after this time are dropped [s].
 
 
 class Outlet(Generic[Item]):
     """Target with its own queue and thread; the thread calls `send` with one item at a time.
 
-    `full` selects the action when the queue is full: "drop" drops and counts the item (live), "wait" waits (replay of
-    recorded files). `dropped` is the number of dropped items, and `failed` the number of items that the target refused.
-    `failure` is the reason why the last item was refused, blank if it was accepted.
+    `full` selects the action when the queue is full: "drop" drops and counts the new item (live), "wait" waits for room
+    in the queue (replay of recorded files). `dropped` is the number of dropped items, and `failed` the number of items
+    that the target refused. `failure` is the reason why the last item was refused, blank if it was accepted.
     """
 
     def __init__(self, name: str, send: Callable[[Item], None], *, waiting: int, full: str = "drop") -> None:
@@ -93,11 +92,10 @@ class Outlet(Generic[Item]):
             raise OutputError(f"{self.name}: {self.failure}")
 
 
-#: Number of bytes that may wait for a client of a TCP sink; a client for which more bytes wait is disconnected.
+#: A client of a TCP sink for which more than this number of bytes wait is disconnected.
 _LARGEST_BACKLOG: Final = 1 << 20
-#: Longest wait for an MQTT broker to accept a connection [s].
-_ANSWER_S: Final = 10.0
-#: Longest wait for the last messages to be sent when an MQTT target is closed [s].
+_ANSWER_S: Final = 10.0  #: A connection that an MQTT broker has not accepted after this time has failed [s].
+#: When an MQTT target is closed, messages that are not sent within this time are lost [s].
 _LEFT_S: Final = 2.0
 _HELP: Final = (
     "expected FORM@TARGET, where FORM is json, cbor, nmea, tpv, etcs, positions, train or passings, and TARGET is -, a "
@@ -106,10 +104,10 @@ _HELP: Final = (
 
 
 class Sink(Protocol):
-    """Target of outputs, which counts the messages that do not reach the reader."""
+    """Target that receives outputs, and counts the messages that do not reach the reader."""
 
     name: str  #: Name of the sink in counts and error messages.
-    dropped: int  #: Number of messages dropped for a slow reader.
+    dropped: int  #: Number of messages that were dropped because the reader was too slow.
     failed: int  #: Number of messages that the target refused.
     failure: str  #: Reason why the target refused the last message; blank if it was accepted.
 
@@ -124,15 +122,15 @@ class Sink(Protocol):
 class ByteTarget:
     """File or standard output, written without a buffer, so that messages reach their reader at once.
 
-    The earlier content of a file is kept until the first epoch's message replaces it. Messages without input wait for
-    this message, because a session whose sources cannot be opened sends only messages without input.
+    The earlier content of a file is kept until the first epoch's message replaces it. Until then, messages of periods
+    without input are held back, so that a session whose sources cannot be opened does not replace the content.
     """
 
     form: Form
     file: IO[bytes]
-    path: Path | None = None  #: None for the standard output.
-    #: Messages that wait while the file still has its earlier content; None if the earlier content has been replaced,
-    #: or there was none.
+    path: Path | None = None  #: Path of the file; None for the standard output.
+    #: Messages that are held back while the file has its earlier content; None if the earlier content has been
+    #: replaced, or there was none.
     waiting: bytes | None = None
 
     def send(self, output: LiveOutput) -> None:
@@ -235,7 +233,7 @@ class MqttTarget:
             if self._client.is_connected():
                 info.wait_for_publish(max(until - time.monotonic(), 0.0))
         self._client.disconnect()
-        # in a thread, because this call would not return while the broker keeps the connection open but reads nothing
+        # in a thread, because the call would not return while the broker keeps the connection open but reads nothing
         ending = threading.Thread(target=self._client.loop_stop, daemon=True)
         ending.start()
         ending.join(max(until - time.monotonic(), 0.5))
@@ -313,7 +311,7 @@ def parse_file_target(text: str) -> Path | None:
 
 
 def _open_without_change(path: Path) -> IO[bytes]:
-    """Open a file for writing without a buffer; its content remains. Raise OSError if it cannot be opened."""
+    """Open a file for writing without a buffer, and keep its content. Raise OSError if the file cannot be opened."""
     return open(path, "wb", buffering=0, opener=lambda name, flags: os.open(name, flags & ~os.O_TRUNC, 0o666))
 
 
@@ -323,8 +321,8 @@ async def open_sink(
     """Open the sink specified by a text ``FORM@TARGET``; for `full` see `Outlet`.
 
     The content of an existing file remains until the first epoch's message. Raise SettingsError if the text has no
-    valid form or target. Raise OutputError if the target cannot be opened, or is an existing file and `overwrite` is
-    "refuse".
+    valid form or target. Raise OutputError if the target cannot be opened, or if it is an existing file and `overwrite`
+    is "refuse".
     """
     settings = settings or LiveSettings()
     name, at, target = text.partition("@")

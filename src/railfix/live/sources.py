@@ -21,9 +21,9 @@ from railfix.core.files import open_stream
 from railfix.live.settings import LiveSettings
 
 Item = TypeVar("Item")
-#: Function that returns the present position as a GGA sentence, or no bytes without a position.
+#: Function that returns the present position as a GGA sentence, or empty bytes if there is no position.
 Place = Callable[[], bytes]
-#: Function that writes to the other end of a connection until the function is cancelled.
+#: Function that writes to the other end of a connection until it is cancelled.
 Send = Callable[[asyncio.StreamWriter], Coroutine[None, None, None]]
 
 _BLOCK = 4096
@@ -31,26 +31,21 @@ _FORMS = (
     "a file, tcp://HOST:PORT, serial:DEVICE?baud=115200, ntrip://[USER:PASSWORD@]HOST:PORT/MOUNT (ntrips:// over TLS), "
     "or - (standard input)"
 )
-#: URL schemes of NTRIP: without TLS, with TLS.
-_NTRIP = ("ntrip", "ntrips")
-#: Longest wait for a connection to open [s].
-_CONNECT_S = 10.0
-#: Longest wait for a byte in one read of a serial line [s].
-_SERIAL_S = 0.05
-#: Timeout of a second read after a first timeout, for bytes that arrived while the program was busy [s].
+_NTRIP = ("ntrip", "ntrips")  #: URL schemes of NTRIP without TLS and with TLS.
+_CONNECT_S = 10.0  #: A connection that is not open after this time has failed [s].
+_SERIAL_S = 0.05  #: Timeout of one read of a serial line [s].
+#: A read that has timed out is repeated with this timeout, to get bytes that arrived while the program was busy [s].
 _ONCE_MORE_S = 0.02
-#: Longest wait before the next attempt to send a position to a caster, while there is no position [s].
-_NO_PLACE_S = 1.0
-#: Longest header of a caster's answer [bytes].
-_HEADER_BYTES = 65_536
-#: Number of leading bytes of a caster's content that are examined to reject content other than a receiver's stream.
+_NO_PLACE_S = 1.0  #: While there is no position to send to a caster, a new attempt is made after at most this time [s].
+_HEADER_BYTES = 65_536  #: A caster's answer with a longer header is rejected [bytes].
+#: Number of first bytes of a caster's stream that are examined, to reject content that is not a receiver's stream.
 _TELLING_BYTES: Final = 16
-_OK: Final = 200  #: HTTP status of a successful answer.
+_OK: Final = 200  #: HTTP status code of a successful answer.
 
 
 @dataclass(frozen=True)
 class Connected:
-    """Event: a connection has been opened; `broken` is the number of times that the connection broke before."""
+    """Event: a connection has been opened; `broken` is the number of times that the connection has broken before."""
 
     broken: int
 
@@ -120,7 +115,7 @@ async def read_source(
 async def _keep_open(
     opened: Callable[[], AsyncIterator[bytes]], settings: LiveSettings
 ) -> AsyncIterator[bytes | Connected | Lost]:
-    """Yield the bytes and events of a connection; if it breaks, it is reopened after increasing waits.
+    """Yield the bytes and events of a connection. A connection that breaks is opened again, after waits that increase.
 
     `opened` returns an iterator that yields empty bytes once the connection is open, and then the received bytes.
     """
@@ -210,10 +205,10 @@ async def _tcp(
 
 
 async def _ntrip(source: str, settings: LiveSettings, place: Place | None) -> AsyncIterator[bytes]:
-    """Yield the bytes of an NTRIP caster's mount point; the request is NTRIP 2, the answer may be NTRIP 1.
+    """Yield the bytes of an NTRIP caster's mount point; the request is NTRIP 2, but the answer may be NTRIP 1.
 
-    If `LiveSettings.gga_s` is not 0, the train's position is sent for a virtual station. A position that is already
-    known is part of the request (NTRIP 2); later positions are sent as lines.
+    If `LiveSettings.gga_s` is not 0, the train's position is sent to the caster, as a virtual reference station
+    requires. A position that is already known is part of the request (NTRIP 2); later positions are sent as lines.
     """
     if settings.gga_s == 0.0:
         place = None
@@ -262,7 +257,7 @@ class _Answer:
         self._plain = self.begun = self.ended = False
 
     def request(self, sentence: bytes) -> bytes:
-        """Return the request for the mount point; the request contains the GGA sentence `sentence`, if not empty.
+        """Return the request for the mount point; it contains the GGA sentence `sentence`, unless this is empty.
 
         Raise SettingsError if no valid request can be made from the source.
         """
@@ -322,7 +317,7 @@ class _Answer:
         return bytes(content)
 
     def check(self) -> None:
-        """Raise InputFileError if the bytes passed to `take` were not HTTP."""
+        """Raise InputFileError if bytes that were passed to `take` should be HTTP but are not."""
         if self._broken is not None:
             raise self._broken
 

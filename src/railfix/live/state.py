@@ -1,8 +1,8 @@
 """State file from which a restarted session continues; the file is written regularly, and checked before use.
 
 The first line of the file is JSON with the versions, the hashes of map, vehicle and settings, and the length and
-SHA-256 of the state, which follows this line. A state is used only if it is complete and the versions and hashes agree
-with the session. The state contains only plain values, arrays and data classes of this package
+SHA-256 of the state. The state follows this line. A state is used only if it is complete and the versions and hashes
+agree with the session. The state contains only plain values, arrays and data classes of this package
 (`railfix.live.state_values`); reading the file does not execute code from it.
 """
 
@@ -44,7 +44,7 @@ class Loaded:
     """Outcome of reading a state file."""
 
     session: SavedSession | None  #: State read from the file; None if the file is not used.
-    outcome: str  #: One sentence for the log.
+    outcome: str  #: Sentence for the log: whether the file is used, and why not.
 
 
 def belongs_to(
@@ -89,7 +89,7 @@ def write_state(path: Path, session: SavedSession, under: Mapping[str, Any]) -> 
 
 
 def check_state_path(path: Path) -> None:
-    """Raise OutputError if no state can be written to a path; called before the session starts."""
+    """Raise OutputError if no state can be written to a path; to be called before the session starts."""
     if path.exists() and not path.is_file():
         raise OutputError(f"{path}: is not a regular file, and no state can be written there; give another file")
     try:

@@ -172,13 +172,10 @@ async def next_arrival(
     return None
 
 
-#: Time later than any epoch.
-FOREVER: Final = np.datetime64("2200-01-01", "ns")
-#: Columns that must contain a number in every row that has more than the time.
-_NEEDED: Final = ("pulse", "range_m")
-#: Columns that contain names.
-_NAMES: Final = ("unit", "balise")
-#: Largest number of bytes of an incomplete line that are kept; the beginning of a longer line is dropped.
+FOREVER: Final = np.datetime64("2200-01-01", "ns")  #: Time that is later than any epoch.
+_NEEDED: Final = ("pulse", "range_m")  #: Columns that must have a number, except in rows with only a time.
+_NAMES: Final = ("unit", "balise")  #: Columns that contain names instead of numbers.
+#: Number of last bytes of an incomplete line that are kept; the beginning of a longer line is dropped.
 _LINE_BYTES: Final = 4096
 
 
@@ -188,7 +185,7 @@ class Sensed:
 
     sensor: str
     samples: SensorSamples = field(default_factory=SensorSamples)
-    #: Time up to which the sensor has reported; NaT before the first row, `FOREVER` for a complete table.
+    #: Time up to which the sensor has reported; NaT before the first row, `FOREVER` for a table or an ended stream.
     until: np.datetime64
     skipped: int = 0  #: Number of lines that are not valid rows, or are older than the previous row.
 
@@ -203,9 +200,9 @@ class SensorLines:
 
     sensor: str  #: Sensor, one of `railfix.motion.samples.SENSORS`.
     source: str  #: Name of the sensor's source in error messages.
-    columns: tuple[str, ...] = ()  #: Names of the columns; empty before the header line.
-    until: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Time of the last row.
-    rest: bytes = b""  #: Incomplete last line.
+    columns: tuple[str, ...] = ()  #: Names of the columns in the header line; empty until this line is received.
+    until: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Time of the last valid row.
+    rest: bytes = b""  #: Bytes of the last line, which is still incomplete.
 
     def after_break(self) -> None:
         """Drop the incomplete line after a break of the connection."""
@@ -278,27 +275,24 @@ class SensorLines:
         return SensorSamples(**samples)
 
 
-#: Largest drift of the computer's clock relative to GPS time [s/s]; the shortest delay in `Lag` grows at this rate.
+#: Assumed drift of the computer's clock relative to GPS time [s/s]; the shortest delay in `Lag` grows at this rate.
 DRIFT: Final = 1e-4
-#: Time for which a delay must be constant to count as an offset of the time tags [s]. A delay of processing would not
-#: be constant: it decreases while epochs are skipped, or increases if the computer is too busy even to skip them.
+#: A delay that is constant for longer than this counts as an offset of the time tags [s]. A delay of processing would
+#: not be constant: it decreases while epochs are skipped, or increases if the computer is too busy even to skip them.
 ADMITTED_S: Final = 2.0
-#: Largest change of a delay that counts as constant [s].
-STEADY_S: Final = 0.2
-#: Number of epochs that must be skipped while the delay is constant before it counts as an offset of the time tags.
+STEADY_S: Final = 0.2  #: A delay counts as constant if it changes by at most this [s].
+#: Least number of epochs that are skipped with a constant delay before the delay counts as an offset of the time tags.
 STEADY_EPOCHS: Final = 5
 
 
 @dataclass(kw_only=True)
 class Lag:
-    """Delay of epochs compared with the shortest delay so far, so that the clocks of receiver and computer need not
-    agree.
-    """
+    """Delay of epochs beyond the shortest delay so far, so that the clocks of receiver and computer need not agree."""
 
-    #: Delay above which epochs are skipped, until the delay has fallen to a quarter of this limit [s]; may be infinite.
+    #: If the delay exceeds this, epochs are skipped until it has fallen to a quarter of this [s]; may be infinite.
     behind_s: float
-    skipped: int = 0  #: Number of epochs skipped since the delay exceeded the limit.
-    reports: list[str] = field(default_factory=list)  #: Sentences that the session still has to log.
+    skipped: int = 0  #: Number of epochs skipped since the delay exceeded `behind_s`; 0 while none are skipped.
+    reports: list[str] = field(default_factory=list)  #: Sentences that are still to be logged.
     _shortest_ns: float | None = None
     _at_ns: int = 0
     _since_ns: int = 0

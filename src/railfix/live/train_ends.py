@@ -14,8 +14,8 @@ from railfix.core.errors import SettingsError
 from railfix.live.settings import LiveSettings
 from railfix.track.trajectory import Trajectory
 
-#: A train that has run this distance against the direction of its leading end counts as having changed ends [m]. The
-#: distance is assumed to be longer than a train rolls back.
+#: A train that has run this distance against the direction of its leading end counts as having changed ends [m]. A
+#: train is assumed never to roll back this far.
 CHANGED_ENDS_M: Final = 50.0
 
 
@@ -25,8 +25,9 @@ class Ends(NamedTuple):
     If the running direction is unknown, each end may be on either side of the reference point.
     """
 
-    front_m: float  #: Middle of the possible positions of the front end, positive ahead of the reference point.
-    spread_m: float  #: Half-width of the possible positions of the front end: largest distance from `front_m`.
+    #: Position of the front end, positive ahead of the reference point; the middle if several are possible.
+    front_m: float
+    spread_m: float  #: Largest distance of a possible position of the front end from `front_m`.
     foremost_m: float  #: Largest distance of any part of the train ahead of the reference point.
     rearmost_m: float  #: Largest distance of any part of the train behind the reference point.
 
@@ -40,10 +41,10 @@ class TrainFrame:
     """
 
     trajectories: Mapping[str, Trajectory]
-    facing: int  #: Direction of the vehicle's front along the line, 0 if unknown.
-    running: int  #: Direction of the leading end at the start, 0 if unknown.
-    front_m: float  #: Distance by which the vehicle's front end is ahead of the reference point [m]; NaN if unknown.
-    rear_m: float  #: Distance by which the rear end is behind the reference point [m]; NaN if unknown.
+    facing: int  #: Direction of the vehicle's front: 1 toward rising chainage, -1 toward falling, 0 if unknown.
+    running: int  #: Direction of the train's leading end at the start, coded as `facing`.
+    front_m: float  #: Distance from the reference point to the train's end at the vehicle's front [m]; NaN if unknown.
+    rear_m: float  #: Distance from the reference point to the train's end at the vehicle's rear [m]; NaN if unknown.
     length_m: float  #: Length of the train [m]; NaN if unknown.
 
     @classmethod
@@ -128,7 +129,7 @@ class TrainFrame:
         longest, shortest = max(front, rear), min(front, rear)
         if not math.isfinite(front + rear):
             longest = shortest = math.nan
-        if running:  # whether the front or the rear of the vehicle leads is unknown
+        if running:  # it is unknown which end of the vehicle leads
             return Ends((longest + shortest) / 2.0, (longest - shortest) / 2.0, longest, longest)
         return Ends(0.0 if math.isfinite(longest) else math.nan, longest, longest, longest)
 
@@ -141,12 +142,12 @@ class RunningEnd:
     opposite direction. The distance from this position must exceed `CHANGED_ENDS_M` plus the bounds of both positions.
     """
 
-    direction: int  #: 1 toward rising chainage, -1 toward falling, 0 if unknown.
-    #: Upper bound of the lowest chainage of the reference point since the last change of direction [m]; infinite before
-    #: the first position.
+    direction: int  #: Direction: 1 toward rising chainage, -1 toward falling, 0 if unknown.
+    #: Upper bound of the lowest chainage that the reference point has had since the last change of direction [m];
+    #: infinite before the first position.
     low_m: float = math.inf
-    #: Lower bound of the highest chainage of the reference point since the last change of direction [m]; minus infinity
-    #: before the first position.
+    #: Lower bound of the highest chainage that the reference point has had since the last change of direction [m];
+    #: minus infinity before the first position.
     high_m: float = -math.inf
     last_m: float = math.inf  #: Last chainage of the reference point [m]; infinite before the first position.
 
@@ -157,7 +158,7 @@ class RunningEnd:
         if not (math.isfinite(reference_m) and math.isfinite(bound_m)):
             return self
         low, high = min(self.low_m, reference_m + bound_m), max(self.high_m, reference_m - bound_m)
-        # The bounds are reset after a gap, and where the chainage of a closed line starts again.
+        # The bounds are reset after a jump of the chainage: after a gap, or where a closed line begins again at 0.
         if not abs(reference_m - self.last_m) < CHANGED_ENDS_M:
             low, high = reference_m + bound_m, reference_m - bound_m
         direction = self.direction

@@ -33,8 +33,8 @@ from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.state import TrackState
 
-#: Settings, each with the number of epochs to process. Together, they call all single-epoch kernels except the kernels
-#: in `_look_beyond`. With the second settings, there are too few satellites for 3-D positions.
+#: Settings, each with the number of epochs to process with them. Together, they call all single-epoch kernels except
+#: the kernels in `_look_beyond`. The second settings leave too few satellites for 3-D positions.
 _SINGLE_EPOCHS: Final[tuple[tuple[dict[str, Any], int], ...]] = (
     ({"filter": "off"}, 60),
     ({"filter": "off", "systems": ["G"], "elevation": {"mask_deg": 45.0}, "protection": "off"}, 5),
@@ -87,7 +87,7 @@ def compile_filter() -> None:
     state, limits = TrackState(), TrackingLimits()
     chunk = prepare_chunk(epochs, state, limits)
     recursion = Recursion(chunk, line, SensorEpochs(), limits, state, levels=True)
-    recursion.run(state, len(epochs), found=None, trace=None)  # a call without epochs compiles it
+    recursion.run(state, len(epochs), found=None, trace=None)  # a call without epochs compiles the recursion
 
 
 def _read_logs() -> dict[str, Observations]:
@@ -136,5 +136,5 @@ def _first_epochs(log: Path, count: int) -> Observations:
 
 
 def _faulty(log: Observations, satellite: str) -> Observations:
-    """Return the log with one satellite's codes lengthened by 300 m, a fault that RAIM detects."""
+    """Return the log with 300 m added to one satellite's codes, so that RAIM detects a fault."""
     return replace(log, code_m=log.code_m + np.where(log.satellite == satellite, 300.0, 0.0))

@@ -42,24 +42,24 @@ from railfix.io.receiver.nav_messages import (
 )
 from railfix.io.rinex.navigation_records import RawRecord, first_fault, glonass_records, kepler_records
 
-#: Constellation letter by number of an RTCM ephemeris message.
+#: Constellation letter for each number of an RTCM ephemeris message.
 _RTCM_SYSTEMS: Final = {1019: "G", 1044: "J", 1042: "C", 1045: "E", 1046: "E", 1020: "R"}
-_STRINGS_S: Final = 15.0  #: GLONASS strings 1 to 4 are sent in less than this time from the frame start [s].
-_EPOCH_BEFORE_S: Final = 5.0  #: Longest time from an epoch to a GLONASS string that is dated with it [s].
-#: Duration of a GLONASS frame [s].
-_FRAME_S: Final = 30.0
+_STRINGS_S: Final = 15.0  #: The epochs before GLONASS strings 2 to 4 must be less than this after the frame start [s].
+#: The epochs before GLONASS strings 2 to 4 must be less than this before the frame start [s].
+_EPOCH_BEFORE_S: Final = 5.0
+_FRAME_S: Final = 30.0  #: Duration of a GLONASS frame [s].
 
 
 @dataclass(frozen=True, kw_only=True)
 class Unfinished:
     """State of the ephemeris assembly after a piece of a stream."""
 
-    #: Fields of the latest subframe by satellite and subframe number.
+    #: Fields of the latest subframe for each satellite and subframe number.
     latest: Mapping[tuple[str, int], Values] = field(default_factory=dict)
-    #: Issue of the last record by satellite and message. A new record with the same issue is a repetition.
+    #: Issue (`measurements.Record`) of each message's last record. A record with the same issue is a repetition.
     issued: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
-    #: First epoch after the last string, NaT if not yet received, for each GLONASS satellite whose four strings are
-    #: complete. The strings may be from different frames.
+    #: First epoch after the last string of each GLONASS satellite whose four strings are not yet known to be of one
+    #: frame; NaT until this epoch is received.
     waiting: Mapping[str, np.datetime64] = field(default_factory=dict)
 
 
@@ -68,11 +68,11 @@ class Assembled:
     """Records assembled from one piece of a stream, in the order in which they were completed."""
 
     records: tuple[RawRecord, ...]
-    complete_at: Datetimes  #: Time at which each record was complete, NaT where unknown.
+    complete_at: Datetimes  #: Time at which each record was complete; NaT if unknown.
     klobuchar: Mapping[str, np.ndarray]
     leap_seconds: int | None
     skipped: Mapping[str, int]
-    undated: frozenset[str] = frozenset()  #: Satellites with records that could not be dated.
+    undated: frozenset[str] = frozenset()  #: Satellites of which a record could not be dated.
 
 
 def assemble_records(
@@ -83,7 +83,7 @@ def assemble_records(
     after: Datetimes,
     first: np.datetime64,
 ) -> tuple[Assembled, Unfinished]:
-    """Return the ephemerides that one piece of a stream completes, and the unfinished records after it.
+    """Return the ephemerides that one piece of a stream completes, and the state for the next piece.
 
     `time` and `after` are the epochs before and after each subframe, shape (N,), and `first` is the first epoch of the
     piece. Unknown epochs are NaT.
@@ -103,7 +103,7 @@ def assemble_rtcm(
 ) -> tuple[Assembled, Unfinished]:
     """Return the ephemerides in RTCM 3 messages, without repetitions, and the state after the messages.
 
-    `messages` is from `rtcm.ephemeris_fields`, and `time` is the time of reception of each message, shape (N,).
+    `messages` are from `rtcm.ephemeris_fields`, and `time` has the time of reception of each message, shape (N,).
     """
     builder = _EphemerisBuilder(state)
     for (_, kind, values), at in zip(messages, time, strict=True):
@@ -162,7 +162,7 @@ class _EphemerisBuilder:
         return False
 
     def result(self, counts: Counter[str]) -> tuple[Assembled, Unfinished]:
-        """Return the completed records, with the counts of rejected ones added to `counts`, and the new state."""
+        """Return the completed records and the new state. The counts of rejected records are added to `counts`."""
         counts.update(f"{raw.satellite[0]} {why}" for raw, why in self.rejected)
         records = Assembled(
             records=tuple(self.records),
@@ -202,9 +202,9 @@ class _EphemerisBuilder:
         return {"G": self._gps, "J": self._gps, "E": self._galileo, "R": self._glonass}[letter]
 
     def settle(self, until: np.datetime64 | None) -> None:
-        """Append the GLONASS records that wait for an epoch after their last string, if this epoch is known.
+        """Append the waiting GLONASS records for which the first epoch after their last string is known.
 
-        If `until` is given, only records whose epoch is at or before `until` are appended.
+        If `until` is given, only records for which this epoch is at or before `until` are appended.
         """
         for satellite, after in list(self.waiting.items()):
             if not np.isnat(after) and (until is None or after <= until):
@@ -232,7 +232,7 @@ class _EphemerisBuilder:
         return None if any(part is None for part in parts) else [part for part in parts if part is not None]
 
     def _ionosphere_gps(self, letter: str, values: Values) -> None:
-        # GPS page 18 and the QZSS page for the wide area have identity 56; the QZSS page for Japan has identity 61.
+        # GPS page 18 and the QZSS page for the wide area have ID 56; the QZSS page for Japan (ID 61) is not used.
         if values["page_sv"] == 56 and values["data_id"] in (1, 3):
             self.klobuchar[letter] = np.array([values[f"ion{k}"] for k in range(8)])
             self.leap_seconds = int(values["leap_seconds"]) if letter == "G" else self.leap_seconds
@@ -317,8 +317,8 @@ class _EphemerisBuilder:
         if self.needs_date(satellite, time):
             return None
         # All strings must be of one frame, which begins at the time t_k in string 1; one string is sent every 2 s. The
-        # time of string 1 is not tested, because it may precede the receiver's first epoch. If epochs are lost or rare,
-        # the first epoch after the strings is tested instead: it must be within one frame length of t_k.
+        # time of string 1 is not tested, because it may precede the receiver's first epoch. If the test fails, as with
+        # rare epochs, the first epoch after the strings is tested: it must be within one frame length of t_k.
         began = frame_time(parts[0], time)
         if within is None:
             received = np.array([part["received"] for part in parts[1:]]).astype(np.int64).astype("datetime64[ns]")

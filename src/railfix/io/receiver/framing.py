@@ -18,15 +18,15 @@ from railfix.core.arrays import Bytes, Datetimes, Floats, Indices, Integers, Mas
 from railfix.core.checksums import crc24q
 from railfix.core.files import FilePath, open_stream
 
-#: Longest accepted payload or block [bytes]. UBX and SBF allow 65 535, but receivers send less than 16 KiB.
+#: Longer payloads and blocks are not accepted [bytes]. UBX and SBF allow 65 535, but receivers send less than 16 KiB.
 LONGEST_FRAME: Final = 16_384
 _NMEA_LONGEST: Final = 512
 _LETTERS: Final = b"\x00ABCDEFGHIJKLMNOPQRSTUVWXYZ"
-#: Whether each byte is valid as the first (row 0) and second (row 1) character of an NMEA address. The byte 0, which is
-#: read beyond the end of the buffer, is valid.
+#: Whether each byte is valid as the first (row 0) and second (row 1) character of an NMEA address. The byte 0 is valid:
+#: bytes beyond the end of the buffer are read as 0.
 _ADDRESS: Final = np.array([[c in text for c in range(256)] for text in (_LETTERS, _LETTERS + b"0123456789")])
 
-#: Value of each byte as a hexadecimal digit; 255 for other bytes.
+#: Value of each byte as a hexadecimal digit; 255 for bytes that are no such digit.
 _HEX: Final = np.full(256, 255)
 _HEX[np.frombuffer(b"0123456789ABCDEFabcdef", np.uint8)] = [*range(16), *range(10, 16)]
 
@@ -36,15 +36,15 @@ class Frames:
     """Frames with valid checksums, in order of the stream."""
 
     data: Bytes  #: Buffer that contains the frames.
-    protocol: Strings  #: "ubx", "rtcm3", "sbf" or "nmea"; shape (N,).
+    protocol: Strings  #: Protocol of each frame, "ubx", "rtcm3", "sbf" or "nmea"; shape (N,).
     kind: Integers  #: UBX: class * 256 + id; RTCM 3: message number; SBF: block number; NMEA: 0; shape (N,).
     #: Start and end of the payload in `data`, shape (N,). A UBX or RTCM 3 payload excludes header and checksum; the
     #: RTCM message number is included. An SBF payload begins at the time stamp, after the header of 8 bytes. An NMEA
     #: payload is the text from ``$`` to the character before ``*``.
     start: Indices
     end: Indices
-    frame_start: Indices  #: Offset of the first sync byte of the frame, shape (N,).
-    consumed: int  #: Number of processed bytes of the buffer; the rest may be the start of a frame.
+    frame_start: Indices  #: Offset of each frame's first sync byte in `data`, shape (N,).
+    consumed: int  #: Number of processed bytes of the buffer; the bytes after them may be the start of a frame.
     skipped_bytes: int  #: Number of processed bytes outside frames.
     bad_checksums: int  #: Number of complete frames with a wrong checksum that begin outside all valid frames.
 
@@ -52,7 +52,7 @@ class Frames:
         return len(self.start)
 
     def of(self, protocol: str, *kinds: int) -> Indices:
-        """Return the indices of a protocol's frames of the given kinds; without kinds, of all its frames."""
+        """Return the indices of a protocol's frames of the given kinds, or of all its frames if no kind is given."""
         own = self._by_protocol.get(protocol, np.empty(0, dtype=np.intp))
         return own[np.isin(self.kind[own], kinds)] if kinds and len(own) else own
 
@@ -225,7 +225,7 @@ def _nmea(data: Bytes, *, at_end: bool) -> _FrameCandidates:
     return _FrameCandidates("nmea", frame, np.zeros(len(frame), np.int64), frame, end, frame_end, valid)
 
 
-#: A log is recognised if this number of first bytes contains a frame with a valid checksum.
+#: Number of first bytes of a file in which frames are searched to recognise a receiver log.
 _HEAD_BYTES: Final = 1 << 16
 
 
@@ -296,8 +296,8 @@ class Subframes(RowArrays):
     glonass_channel: Integers  #: Frequency channel of a GLONASS satellite, shape (N,).
     #: Words of 30 or 32 bits, right-aligned; unused words are 0; shape (N, 10).
     words: np.ndarray[tuple[int, int], np.dtype[np.uint32]]
-    order: Integers  #: Offset in the stream, shape (N,).
-    skipped: Mapping[str, int] = field(default_factory=dict)  #: Number of skipped pages by reason.
+    order: Integers  #: Offset of each subframe in the stream, shape (N,).
+    skipped: Mapping[str, int] = field(default_factory=dict)  #: Number of skipped pages for each reason.
 
     def __len__(self) -> int:
         return len(self.satellite)
@@ -311,7 +311,7 @@ def join_subframes(first: Subframes, second: Subframes) -> Subframes:
     return both.take(np.argsort(both.order, kind="stable"))
 
 
-#: Signal numbers in `Subframes` that UBX does not define: SBAS on L5, and B-CNAV1 pages.
+#: Values of `Subframes.signal` that UBX does not define, for SBAS on L5 and for B-CNAV1 pages.
 SBAS_L5, BCNAV1_PAGE = -5, -6
 
 
@@ -319,11 +319,11 @@ SBAS_L5, BCNAV1_PAGE = -5, -6
 class SbasFrames:
     """SBAS messages output by a receiver, N rows. Preamble and parity have not been checked."""
 
-    #: Time of the last epoch before the message plus 1 ns, shape (N,); NaT before the first time in the log.
+    #: Time of reception: 1 ns after the epoch before the message, shape (N,); NaT before the first time in the log.
     time: Datetimes
 
-    prn: Integers  #: PRN of the satellite, shape (N,).
-    octets: Bytes  #: Message of 250 bits, beginning with the preamble, padded with zeros; shape (N, 32).
+    prn: Integers  #: PRN of the SBAS satellite, shape (N,).
+    octets: Bytes  #: Bytes of the message: 250 bits, beginning with the preamble, and zeros; shape (N, 32).
     on_l5: Masks  #: Whether the message was sent on L5 instead of L1, shape (N,).
 
     def __len__(self) -> int:

@@ -1,7 +1,7 @@
 """Read observations, ephemerides, interference indicators and positions from receiver logs (UBX, RTCM 3, SBF).
 
 Sources: u-blox interface descriptions F9 HPG 1.32 (UBX-22008968), sections 3.14.5 (MON-RF), 3.14.2 (MON-HW), and X20
-HPG 2.00 (SEC-SIG 1 and 2, SEC-SIGLOG); Septentrio mosaic-X5 reference guide 4.14, section 4.2.14 (both status blocks).
+HPG 2.00 (SEC-SIG 1 and 2, SEC-SIGLOG); Septentrio mosaic-X5 reference guide 4.14, 4.2.14 (RFStatus, ReceiverStatus).
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ RECEIVER_STATUS: Final = 4014
 
 JAMMING, SPOOFING = 1, 2  #: Bits of `Observations.receiver_alarm`.
 #: Lowest u-blox state that sets an alarm (jamming critical, spoofing affirmed). State 2 (jamming warning, spoofing
-#: indicated) sets none, because it was sent in 571 of the 581 s of a recording without interference.
+#: indicated) sets no alarm, because it was sent in 571 of the 581 s of a recording without interference.
 _CERTAIN: Final = 3
-_NOT_MITIGATED: Final = 8  #: Value of the Septentrio mode field for unmitigated interference.
+_NOT_MITIGATED: Final = 8  #: Value of the mode in Septentrio RFStatus for interference that is not mitigated.
 _MON_HW_BYTES: Final = 60
-_BLOCK: Final = 24  #: Bytes of each block in u-blox MON-RF; the header before the blocks has four bytes.
-_BANDS, _FRONT_ENDS = 12, 24  #: Payload offset of the first block in RFStatus and in ReceiverStatus.
+_BLOCK: Final = 24  #: Size of each block in u-blox MON-RF [bytes]; the header before the blocks has four bytes.
+_BANDS, _FRONT_ENDS = 12, 24  #: Offset of the first sub-block in the payload of RFStatus and of ReceiverStatus [bytes].
 _NO_GAIN: Final = -128
-_EVENT: Final = 8  #: Bytes of each event in u-blox SEC-SIGLOG.
+_EVENT: Final = 8  #: Size of each event in u-blox SEC-SIGLOG [bytes].
 _TRIGGERED_S: Final = 10  #: Duration of the alarm that a single-trigger event of SEC-SIGLOG sets [s].
 _SIMULATED: Final = 0  #: SEC-SIGLOG detection type "simulated signal"; no other type sets an alarm.
 
@@ -57,8 +57,8 @@ _SIMULATED: Final = 0  #: SEC-SIGLOG detection type "simulated signal"; no other
 class Indicators:
     """Latest interference indicators of a receiver."""
 
-    alarm: Mapping[int, int] = field(default_factory=dict)  #: Alarm bits by kind of message.
-    gain: float = np.nan  #: Front-end gain in the receiver's unit, NaN before the first gain.
+    alarm: Mapping[int, int] = field(default_factory=dict)  #: Alarm bits in the latest message of each kind.
+    gain: float = np.nan  #: Front-end gain in the receiver's unit; NaN until a gain has been received.
 
 
 def indicators_at(frames: Frames, places: Integers, before: Indicators) -> tuple[Bytes, Floats, Indicators]:
@@ -112,7 +112,7 @@ def _mon_hw(data: Bytes) -> tuple[int, float] | None:
 
 
 def _sec_sig(data: Bytes) -> tuple[int, float] | None:
-    """Return the jamming and spoofing bits, or None for an unknown version. A bit is 0 if its detection is off."""
+    """Return the jamming and spoofing bits, or None for an unknown version. A bit is 0 where the detection is off."""
     if len(data) >= 12 and data[0] == 1:
         jamming, spoofing = int(data[4]), int(data[8])
     elif len(data) >= 4 and data[0] == 2:
@@ -127,7 +127,7 @@ def _sec_siglog(data: Bytes) -> tuple[int, float] | None:
     """Return the spoofing bit. It is set while a simulated signal lasts, and for 10 s after a single-trigger event.
 
     Events of abnormal signals, inconsistent inertial data and abrupt changes are ignored, because tunnels cause them.
-    Jamming events are ignored, because they begin with a warning. Return None for a malformed message.
+    Jamming events are ignored, because they already report warnings. Return None for a malformed message.
     """
     if len(data) < 8 or len(data) != 8 + _EVENT * int(data[1]):
         return None
@@ -187,7 +187,7 @@ def read_receiver_positions(path: FilePath, *, date: np.datetime64 | None = None
     return PositionLog(path=str(path), line=np.arange(1, len(columns["time"]) + 1), **columns)
 
 
-#: Kinds of messages with observations.
+#: Kinds of messages that contain observations.
 _RAWX: Final = "UBX RXM-RAWX"
 _MEAS_EPOCH: Final = "SBF MeasEpoch"
 _MSM: Final = "RTCM 3 MSM"
@@ -200,8 +200,8 @@ class LogPiece:
     measurements: Measurements
     ephemerides: Assembled
     sbas: SbasFrames
-    station: tuple[float, float, float] | None = None  #: Position of the base station (RTCM 3), ECEF [m].
-    skipped_bytes: int = 0  #: Number of bytes outside frames.
+    station: tuple[float, float, float] | None = None  #: Base station's position, ECEF [m]; None if unknown.
+    skipped_bytes: int = 0  #: Number of processed bytes that belong to no valid frame.
     bad_checksums: int = 0
     bytes: int = 0  #: Number of processed bytes.
 
@@ -213,11 +213,11 @@ class StreamState:
     rest: bytes = b""  #: Bytes that are not yet processed: an incomplete frame or epoch.
     subframes: Unfinished = field(default_factory=Unfinished)
     messages: Unfinished = field(default_factory=Unfinished)
-    #: Time of the last epoch. Before the first epoch, a time within half a week of the stream, or NaT if unknown.
+    #: Time of the last epoch. Before the first epoch, any time within half a week of the stream, or NaT if unknown.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     glonass_channels: Mapping[int, int] = field(default_factory=dict)
-    observed: bool = False  #: Whether UBX or SBF measurements with a time have been decoded.
-    kind: str = ""  #: Kind of observation messages that are used; blank before the first epoch.
+    observed: bool = False  #: Whether dated UBX or SBF measurements have been decoded.
+    kind: str = ""  #: Kind of observation message that is used; blank before the first epoch.
     clock: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Latest time in any message.
     indicators: Indicators = field(default_factory=Indicators)
     station: tuple[float, float, float] | None = None  #: `LogPiece.station`.
@@ -322,7 +322,7 @@ class _Dated(NamedTuple):
         return np.where(index < 0, before, self.times[np.maximum(index, 0)])
 
     def first_after(self, places: Integers) -> Datetimes:
-        """Return the time of the first epoch at or after each offset, or NaT if no epoch follows."""
+        """Return the time of the first epoch at or after each offset, or NaT if there is none."""
         times = np.append(self.times, np.datetime64("NaT", "ns"))
         return np.asarray(times[np.searchsorted(self.places, places)])
 
@@ -343,7 +343,7 @@ def _date(frames: Frames, raw: Measurements, epochs_at: Integers, *, observed: b
 def _navigation(
     frames: Frames, dated: _Dated, msm: _Dated, state: StreamState
 ) -> tuple[Assembled, SbasFrames, Unfinished, Unfinished]:
-    """Return the ephemerides and SBAS messages of a block, and the unfinished records of subframes and of RTCM 3."""
+    """Return the ephemerides and SBAS messages of a block, and the states for later subframes and RTCM 3 messages."""
     subframes = join_subframes(ubx.sfrbx_subframes(frames), sbf.navigation_subframes(frames))
     received = dated.last_before(subframes.order, state.time if np.isnat(state.clock) else state.clock)
     after = dated.first_after(subframes.order)
@@ -378,7 +378,7 @@ def scan_pieces(
                 return
 
 
-_SAME_WEEK: Final = np.timedelta64(5, "D")  #: Largest accepted difference between `date` and ephemerides.
+_SAME_WEEK: Final = np.timedelta64(5, "D")  #: Largest accepted difference between `date` and the ephemerides' time.
 
 
 def _week_of_log(path: FilePath, date: np.datetime64 | None) -> np.datetime64:
@@ -400,7 +400,7 @@ def _week_of_log(path: FilePath, date: np.datetime64 | None) -> np.datetime64:
 
 
 def at_station(observations: Observations, station: tuple[float, float, float] | None) -> Observations:
-    """Return the observations with the base station's position in the header, or unchanged if `station` is None."""
+    """Return the observations with `station` as the position in the header; unchanged if `station` is None."""
     if station is None:
         return observations
     return replace(observations, header=replace(observations.header, approximate_ecef_m=np.array(station)))

@@ -29,9 +29,9 @@ class Measurements:
     """Measurements of a log, N rows in T epochs."""
 
     time: Datetimes  #: Time tags in the order of the stream, shape (T,).
-    epoch: Indices  #: Epoch of each measurement, shape (N,).
-    #: Satellite and signal of each measurement, shape (N,). They are blank where RINEX has no name; such measurements
-    #: are counted but not used.
+    epoch: Indices  #: Index in `time` of each measurement, shape (N,).
+    #: Satellite and signal of each measurement, shape (N,). A name is blank if RINEX has none for the satellite or
+    #: signal; such measurements are counted but not used.
     satellite: Strings
     signal: Strings
     #: Measured values, shape (N,); NaN where the receiver sent no value or declared it invalid.
@@ -39,14 +39,14 @@ class Measurements:
     phase_cycles: Floats
     doppler_hz: Floats
     cn0_dbhz: Floats
-    lock_s: Floats  #: Lock time: least time of continuous phase tracking, shape (N,).
+    lock_s: Floats  #: Lock time: lower bound of the time for which the phase has been continuous, shape (N,).
     half_cycle: Masks  #: Whether a half-cycle ambiguity of the phase is unresolved, shape (N,).
-    polarity: Integers  #: Phase polarity, shape (N,); a change is a half-cycle jump of the phase.
+    polarity: Integers  #: Phase polarity, shape (N,); if it changes, the phase has jumped by half a cycle.
     glonass_channel: Integers  #: GLONASS frequency channel, shape (N,); unknown if outside -7 to 6.
     leap_seconds: int | None = None
     receiver: str = ""
     skipped: Mapping[str, int] = field(default_factory=dict)
-    #: Interference indicators at each epoch, shape (T,); see `Observations.receiver_alarm` and `front_end_gain`.
+    #: `Observations.receiver_alarm` and `Observations.front_end_gain` at each epoch, shape (T,); None if not sent.
     alarm: Bytes | None = None
     gain: Floats | None = None
 
@@ -56,7 +56,7 @@ class Tracking:
     """State of phase tracking after a piece of a log."""
 
     last: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Time of the last epoch.
-    #: Lock time [s] and polarity of the last phase measurement, by channel name ("G051C").
+    #: Lock time [s] and polarity of the last phase measurement of each channel ("G051C": satellite and signal).
     lock: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
@@ -190,7 +190,7 @@ def join_measurements(parts: Sequence[Measurements]) -> Measurements:
     )
 
 
-#: Navigation record, and its issue: the values by which it is distinguished from other records of the satellite.
+#: Navigation record and its issue, which are the values that distinguish it from other records of the satellite.
 Record = tuple[RawRecord, tuple[float, ...]]
 
 _GALILEO_WEEK_MINUS_GPS: Final = 1024
@@ -234,7 +234,7 @@ def cnav_record(satellite: str, values: Values) -> Record:
 def bcnav_record(satellite: str, message: str, values: Values) -> Record | None:
     """Return the BeiDou record from the fields of B-CNAV1 or B-CNAV2, which have the full week.
 
-    Return None if the fields are of another satellite, or if the orbit type is unknown.
+    Return None if the fields belong to a satellite other than `satellite`, or if the orbit type is unknown.
     """
     if int(values["kind"]) not in nav_messages.BCNAV_AXIS_M or f"C{int(values['number']):02d}" != satellite:
         return None
@@ -301,7 +301,7 @@ def glonass_record(satellite: str, values: Values, time: np.datetime64) -> Recor
 
 
 def frame_time(values: Values, time: np.datetime64) -> Datetimes:
-    """Return the GPS time of the GLONASS frame start in string 1. The time of reception `time` resolves the day."""
+    """Return the GPS time of a GLONASS frame's start from string 1. The time of reception `time` resolves the day."""
     utc = gpst_to_utc(time)
     return np.asarray(time + (nearest_day(_frame_s(values), utc) - utc))
 

@@ -21,23 +21,23 @@ from railfix.core.checksums import crc24q
 from railfix.io.receiver.framing import BCNAV1_PAGE, Field, Subframes, fields, read_unsigned, unpack_words
 
 _PI: Final = np.pi
-Coding = tuple[int, float, str]  #: Number of bits, scale factor and coding of a field, as in `Field`.
+Coding = tuple[int, float, str]  #: Number of bits, scale factor and coding ("u", "s", "m") of a field, as in `Field`.
 Values = Mapping[str, float]  #: Fields of a message by name.
 Place = int | tuple[tuple[int, int], ...]
 
 
 def layout(codings: Mapping[str, Coding], **places: Place) -> dict[str, Field]:
-    """Return the layout of a message. `places` has the first bit of each field, or the pieces of a divided field."""
+    """Return the layout of a message. `places` has the first bit, or the pieces, of each field."""
     return {name: (place, *codings[name]) for name, place in places.items()}
 
 
 def _with_head(head: dict[str, Field], kinds: dict[int, dict[str, Field]]) -> dict[int, dict[str, Field]]:
-    """Return layouts by kind of message, with the fields `head`, which all kinds have, added to each layout."""
+    """Return the layout of each kind of message, with the common fields `head` added."""
     return {kind: head | fields for kind, fields in kinds.items()}
 
 
 def _flags(**lengths: int) -> dict[str, Coding]:
-    """Return the codings of unsigned numbers without a factor."""
+    """Return the codings of unsigned integers, whose scale factor is 1."""
     return {name: (length, 1.0, "u") for name, length in lengths.items()}
 
 
@@ -74,7 +74,7 @@ LNAV_CODINGS: Final[dict[str, Coding]] = {
     "af0_s": (22, 2.0**-31, "s"),
     "leap_seconds": (8, 1.0, "s"),
 }
-#: Fields that all LNAV subframes have. Subframes are decoded without parity, as 10 words of 24 bits.
+#: Layout of the fields that all LNAV subframes have. Subframes are decoded without parity, as 10 words of 24 bits.
 LNAV_HEAD: Final = layout(LNAV_CODINGS, tow_s=24, subframe=43)
 LNAV: Final = _with_head(LNAV_HEAD, {
     1: layout(LNAV_CODINGS, week=48, accuracy=60, health=64, iodc=((70, 2), (168, 8)), group_delay_1_s=160, toc_s=176,
@@ -95,7 +95,7 @@ GALILEO_CODINGS: Final[dict[str, Coding]] = {
     "af1": (21, 2.0**-46, "s"),
     "af2": (6, 2.0**-59, "s"),
 }
-#: Galileo I/NAV words of 128 bits, by word type.
+#: Layout of each type of Galileo I/NAV word (128 bits).
 INAV: Final = {
     1: layout(GALILEO_CODINGS, iod=6, toe_sow_s=16, m0=30, eccentricity=62, sqrt_a=94),
     2: layout(GALILEO_CODINGS, iod=6, omega0=16, i0=48, omega=80, i_dot=112),
@@ -105,7 +105,7 @@ INAV: Final = {
               e1b_invalid=72, week=73, tow_s=85),
     6: layout(GALILEO_CODINGS, tow_s=105),
 }  # fmt: skip
-#: Galileo F/NAV pages of 244 bits, by page type.
+#: Layout of each type of Galileo F/NAV page (244 bits).
 FNAV: Final = {
     1: layout(GALILEO_CODINGS, number=6, iod=12, toc_s=22, af0_s=36, af1=67, af2=88, accuracy=94, group_delay_1_s=143,
               e5a_health=153, week=155, tow_s=167, e5a_invalid=187),
@@ -137,7 +137,7 @@ _CNAV_CODINGS: Final[dict[str, Coding]] = {
     "af2": (10, 2.0**-60, "s"),
     **dict.fromkeys(("group_delay_1_s", *(f"inter_signal_{k}" for k in range(4))), (13, 2.0**-35, "s")),
 }
-#: Fields that all CNAV messages (300 bits) have.
+#: Layout of the fields that all CNAV messages (300 bits) have.
 CNAV_HEAD: Final = layout(_CNAV_CODINGS, number=8, type=14, tow_s=20)
 CNAV: Final = _with_head(CNAV_HEAD, {
     10: layout(_CNAV_CODINGS, week=38, health=51, top=54, accuracy_index=65, toe_sow_s=70, delta_a=81, a_dot=107,
@@ -149,9 +149,9 @@ CNAV: Final = _with_head(CNAV_HEAD, {
     | _klobuchar(192),
 })  # fmt: skip
 CNAV_NO_DELAY_S: Final = -4096 * 2.0**-35  #: Value of an unavailable CNAV group delay (IS-GPS-200N, 30.3.3.3.1.1).
-#: CNAV reference semi-major axis [m] by constellation letter (IS-GPS-200N, table 30-I; IS-QZSS-PNT-005).
+#: Reference semi-major axis of CNAV [m] for each constellation letter (IS-GPS-200N, table 30-I; IS-QZSS-PNT-005).
 CNAV_AXIS_M: Final = {"G": 26_559_710.0, "J": 42_164_200.0}
-#: CNAV reference rate of right ascension [rad/s] (IS-GPS-200N, table 30-I; IS-QZSS-PNT-005).
+#: Reference rate of right ascension of CNAV [rad/s] (IS-GPS-200N, table 30-I; IS-QZSS-PNT-005).
 CNAV_OMEGA_DOT: Final = -2.6e-9 * _PI
 _BCNAV2_CODINGS: Final[dict[str, Coding]] = {
     **_CNAV_ORBIT,
@@ -162,7 +162,7 @@ _BCNAV2_CODINGS: Final[dict[str, Coding]] = {
     "af2": (11, 2.0**-66, "s"),
     **dict.fromkeys(("group_delay_1_s", "group_delay_2_s", "inter_signal_1"), (12, 2.0**-34, "s")),
 }
-#: Fields that all B-CNAV2 messages (288 bits, without preamble and parity symbols) have.
+#: Layout of the fields that all B-CNAV2 messages (288 bits, without preamble and parity symbols) have.
 BCNAV2_HEAD: Final = layout(_BCNAV2_CODINGS, number=0, tow_s=12)
 BCNAV2: Final = _with_head(BCNAV2_HEAD, {
     10: layout(_BCNAV2_CODINGS, week=30, iode=53, toe_sow_s=61, kind=72, delta_a=74, a_dot=100, delta_n=125,
@@ -178,9 +178,9 @@ _BCNAV1_CODINGS: Final[dict[str, Coding]] = {
     "tow_s": (16, 18.0, "u"),
     "inter_signal_0": (12, 2.0**-34, "s"),
 }
-BCNAV1_WITH_HEALTH: Final = (1, 2, 3, 4)  #: Subframe 3 page types that begin with the health status.
-#: Data bits of the three pages into which railfix divides a B-CNAV1 frame: subframe, first bit and end. In a page, the
-#: data bits follow PRN, page number and SOW.
+BCNAV1_WITH_HEALTH: Final = (1, 2, 3, 4)  #: Page types of B-CNAV1 subframe 3 that begin with the health status.
+#: For each of the three pages into which railfix divides a B-CNAV1 frame, the subframe that has its data bits, their
+#: first bit, and their end. In a page, the data bits follow PRN, page number and SOW.
 BCNAV1_PARTS: Final = ((2, 0, 275), (2, 275, 569), (3, 0, 15))
 BCNAV1_HEAD: Final = layout(_BCNAV1_CODINGS, number=0, tow_s=8)
 BCNAV1: Final = _with_head(BCNAV1_HEAD, {
@@ -190,9 +190,9 @@ BCNAV1: Final = _with_head(BCNAV1_HEAD, {
               toc_s=213, af0_s=224, af1=249, af2=271, group_delay_2_s=282, inter_signal_0=294, group_delay_1_s=306),
     2: layout(_BCNAV1_CODINGS, page=24, health=30, flags=32, sismai=35),
 })  # fmt: skip
-#: B-CNAV1 and B-CNAV2 reference semi-major axis [m] by orbit type: 1 GEO, 2 IGSO, 3 MEO.
+#: Reference semi-major axis of B-CNAV1 and B-CNAV2 [m] for each orbit type: 1 GEO, 2 IGSO, 3 MEO.
 BCNAV_AXIS_M: Final = {1: 42_162_200.0, 2: 42_162_200.0, 3: 27_906_100.0}
-CNAV_CHECKED, FNAV_CHECKED, BCNAV2_CHECKED = 276, 214, 264  #: Number of bits before the CRC.
+CNAV_CHECKED, FNAV_CHECKED, BCNAV2_CHECKED = 276, 214, 264  #: Number of bits before the CRC of CNAV, F/NAV and B-CNAV2.
 BEIDOU_CODINGS: Final[dict[str, Coding]] = {
     **_ORBIT,
     **_flags(number=6, tow_s=20, subframe=3, health=1, aodc=5, aode=5, accuracy=4, week=13, toe_high=2, toe_low=15),
@@ -205,7 +205,7 @@ BEIDOU_CODINGS: Final[dict[str, Coding]] = {
     **dict.fromkeys(("cuc", "cus", "cic", "cis"), (18, 2.0**-31, "s")),
     **dict.fromkeys(("crc", "crs"), (18, 2.0**-6, "s")),
 }
-#: Fields that all BeiDou D1 and D2 subframes have (10 words of 30 bits, parity included).
+#: Layout of the fields that all BeiDou D1 and D2 subframes (10 words of 30 bits, with parity) have.
 BDS_HEAD: Final = layout(BEIDOU_CODINGS, tow_s=((18, 8), (30, 12)), subframe=15)
 D1: Final = _with_head(BDS_HEAD, {
     1: layout(BEIDOU_CODINGS, health=42, aodc=43, accuracy=48, week=60, toc_s=((73, 9), (90, 8)), group_delay_1_s=98,
@@ -219,8 +219,8 @@ D1: Final = _with_head(BDS_HEAD, {
               omega_dot=((131, 11), (150, 13)), cis=((163, 9), (180, 9)), i_dot=((189, 13), (210, 1)),
               omega0=((211, 21), (240, 11)), omega=((251, 11), (270, 21))),
 })  # fmt: skip
-#: First bit of each page of D2 subframe 1, if its ten pages are joined to 3000 bits. Fields that extend over two pages
-#: are defined in pieces.
+#: First bit of each of the ten pages of D2 subframe 1, which are joined to 3000 bits. A field that extends over two
+#: pages has a piece in each of them.
 _PAGE: Final = {k: 300 * (k - 1) for k in range(1, 11)}
 D2: Final = layout(
     BEIDOU_CODINGS,
@@ -265,14 +265,14 @@ GLONASS_CODINGS: Final[dict[str, Coding]] = {
     "tau_s": (22, 2.0**-30, "m"),
     "dtau": (5, 2.0**-30, "m"),
 }
-#: Layouts of the GLONASS strings by string number. Each string has 85 bits; the first is the idle bit.
+#: Layout of each GLONASS string, by number. Each string has 85 bits; the first is the idle bit.
 GLONASS: Final = {
     1: layout(GLONASS_CODINGS, hour=9, minute=14, half_minute=20, x_velocity=21, x_acceleration=45, x=50),
     2: layout(GLONASS_CODINGS, health=5, tb_s=9, y_velocity=21, y_acceleration=45, y=50),
     3: layout(GLONASS_CODINGS, relative_frequency=6, ln=20, z_velocity=21, z_acceleration=45, z=50),
     4: layout(GLONASS_CODINGS, tau_s=5, age=32, day=59, slot=70),
 }
-#: Nominal user range accuracy [m] by URA index (GPS, QZSS, BeiDou), as in RINEX (IS-GPS-200N, 20.3.3.3.1.3).
+#: Nominal user range accuracy [m] for each URA index of GPS, QZSS and BeiDou, as in RINEX (IS-GPS-200N, 20.3.3.3.1.3).
 URA_NOMINAL_M: Final = np.array([2, 2.8, 4, 5.7, 8, 11.3, 16, 32, 64, 128, 256, 512, 1024, 2048, 4096, 8192])
 
 
@@ -304,9 +304,9 @@ def sisa_m(index: Floats) -> Floats:
 
 def glonass_hamming(bits: Bytes) -> Masks:
     """Return whether GLONASS strings of 85 bits pass their Hamming code (ICD, 4.7), shape (N,)."""
-    # The ICD numbers the bits from 85, which is sent first, to 1. Its bits 9 to 85 are data bits, at the positions of a
-    # Hamming code that are not powers of two. Its bits 1 to 7 are check bits; check bit k covers the positions with bit
-    # k set.
+    # The ICD numbers the bits from 85, which is sent first, to 1. With these numbers, bits 9 to 85 are data bits; they
+    # are at the positions of a Hamming code that are not powers of two. Bits 1 to 7 are check bits. Check bit k covers
+    # the data bits in whose position the k-th binary digit is 1.
     value = bits[:, 84::-1].astype(np.int64)
     places = np.array([place for place in range(1, 86) if place & (place - 1)])[:77]
     checks = [(value[:, 8:][:, places >> k & 1 == 1].sum(axis=1) + value[:, k]) & 1 for k in range(7)]
@@ -315,20 +315,20 @@ def glonass_hamming(bits: Bytes) -> Masks:
     return np.asarray(~wrong & (total == 0))
 
 
-#: Galileo data-source words for I/NAV on E1-B and on E5b-I; its clock and group delay refer to E5b and E1.
+#: Galileo data-source words for I/NAV on E1-B and on E5b-I. The clock and group delay of I/NAV refer to E5b and E1.
 E1B_SOURCE, E5B_SOURCE = 1 << 0 | 1 << 9, 1 << 2 | 1 << 9
-#: Galileo data-source word for F/NAV; its clock and group delay refer to E5a and E1.
+#: Galileo data-source word for F/NAV, whose clock and group delay refer to E5a and E1.
 E5A_SOURCE: Final = 1 << 1 | 1 << 8
 _UBX_E5B: Final = (5, 6)
 _UBX_E5A: Final = (3, 4)
-_CNAV_SIGNALS: Final = {"G": (3, 4, 6, 7), "J": (4, 5, 8, 9)}  #: UBX numbers of the L2C and L5 signals.
-#: UBX numbers of BeiDou signals with D1 or D2, with B-CNAV1 (B1C) and with B-CNAV2 (B2a).
+_CNAV_SIGNALS: Final = {"G": (3, 4, 6, 7), "J": (4, 5, 8, 9)}  #: UBX numbers of the signals with CNAV, L2C and L5.
+#: UBX numbers of the BeiDou signals that carry D1 or D2, B-CNAV1 (B1C), and B-CNAV2 (B2a).
 _D_SIGNALS, _B1C, _B2A = (0, 1, 2, 3, 4, 10), (5, 6), (7, 8)
 #: Offsets added to the numbers of F/NAV pages, CNAV and B-CNAV2 messages, and B-CNAV1 pages, so that the page numbers
 #: of a satellite are unique.
 FNAV_FROM, CNAV_FROM, BCNAV1_FROM = 200, 300, 400
 _PREAMBLE: Final = 0x8B
-Pages = Iterator[tuple[int, int, Values]]  #: Row in `Subframes`, page number and fields of each page.
+Pages = Iterator[tuple[int, int, Values]]  #: Items: row in `Subframes`, page number and fields of a page.
 
 
 def decode_pages(subframes: Subframes) -> tuple[list[tuple[int, str, int, Values]], Counter[str]]:
@@ -361,7 +361,7 @@ def _of_kinds(
 def _with_crc(
     part: Subframes, here: Masks, checked: int, counts: Counter[str], fault: str, preamble: int | None = None
 ) -> tuple[Bytes, Masks]:
-    """Return the bits of all pages, and whether each page is in `here` and valid. Count the invalid pages in `here`."""
+    """Return the bits of all pages, and whether each is selected by `here` and valid; count selected invalid pages."""
     bits = unpack_words(part.words, drop=0, keep=32)
     if not here.any():
         return bits, here

@@ -22,9 +22,9 @@ from railfix.io.receiver.framing import Field, Frames, fields, read_signed, read
 from railfix.io.receiver.measurements import Measurements, join_measurements, no_measurements
 from railfix.io.receiver.nav_messages import Coding, layout
 
-#: Constellation letter by the first three digits of an MSM number.
+#: Constellation letter for the first three digits of an MSM number.
 SYSTEMS: Final = {107: "G", 108: "R", 109: "E", 110: "S", 111: "J", 112: "C"}
-#: RINEX signal by constellation and number in the MSM signal mask.
+#: RINEX signal for each constellation and number in the MSM signal mask.
 SIGNALS: Final[Mapping[str, Mapping[int, str]]] = {
     "G": dict(zip((2, 3, 4, 8, 9, 10, 15, 16, 17, 22, 23, 24, 30, 31, 32),
                   "1C 1P 1W 2C 2P 2W 2S 2L 2X 5I 5Q 5X 1S 1L 1X".split(), strict=True)),
@@ -39,8 +39,8 @@ SIGNALS: Final[Mapping[str, Mapping[int, str]]] = {
 }  # fmt: skip
 _MS: Final = SPEED_OF_LIGHT * 1e-3
 _HEADER_BITS: Final = 169
-#: Layout by MSM type: fine code (bits, resolution [ms]), fine phase (bits, resolution [ms]), lock time (bits), C/N0
-#: (bits, resolution [dB-Hz]), and whether the message has range rates.
+#: Layout of each MSM type: fine code (bits, resolution [ms]), fine phase (bits, resolution [ms]), lock time (bits),
+#: C/N0 (bits, resolution [dB-Hz]), and whether the message has range rates.
 _LAYOUT: Final = {
     4: (15, 2.0**-24, 22, 2.0**-29, 4, 6, 1.0, False),
     5: (15, 2.0**-24, 22, 2.0**-29, 4, 6, 1.0, True),
@@ -48,16 +48,17 @@ _LAYOUT: Final = {
     7: (20, 2.0**-29, 24, 2.0**-31, 10, 10, 0.0625, True),
 }
 MSM_NUMBERS: Final = tuple(tens * 10 + kind for tens in SYSTEMS for kind in _LAYOUT)
-#: Name under which messages whose week cannot be resolved are counted.
+#: Name of the count of MSM that are not decoded because their week is unknown.
 UNDATED: Final = "RTCM 3 observations without a date"
 IN_GPS_TIME: Final = "BeiDou messages in GPS time, read as such"
-_BEIDOU_LATE_S: Final = 14  #: GPS time minus BeiDou time [s]; error of BeiDou times sent in GPS time.
+#: GPS time minus BeiDou time [s]; BeiDou times sent in GPS time are read this much too late.
+_BEIDOU_LATE_S: Final = 14
 _MOSCOW_S: Final = 10_800.0
 _GLONASS_RANGE: Final = range(-7, 7)
 
 
 def _lock_table(bits: int) -> Floats:
-    """Return the minimum lock time [s] by lock time indicator, DF402 (4 bits) or DF407 (10 bits)."""
+    """Return the minimum lock time [s] for each lock time indicator, DF402 (4 bits) or DF407 (10 bits)."""
     if bits == 4:
         return np.array([0.0] + [2.0 ** (k + 4) for k in range(1, 16)]) * 1e-3
     steps = np.concatenate([np.ones(64), np.repeat(2.0 ** np.arange(1, 21), 32)])
@@ -68,12 +69,12 @@ def _lock_table(bits: int) -> Floats:
 class ChannelNews(NamedTuple):
     """GLONASS frequency channels in order of reception, N rows."""
 
-    place: Indices  #: Offset in the stream, shape (N,).
-    number: Integers  #: Satellite number, shape (N,).
-    channel: Integers  #: Frequency channel, shape (N,).
+    place: Indices  #: Offset of the message in the stream, shape (N,); -1 for channels known before.
+    number: Integers  #: GLONASS slot number, shape (N,).
+    channel: Integers  #: Frequency channel of the satellite, shape (N,).
 
     def latest(self) -> dict[int, int]:
-        """Return the last known channel by satellite number."""
+        """Return the last known channel of each satellite number."""
         return dict(zip(self.number.tolist(), self.channel.tolist(), strict=True))
 
     def at(self, place: Indices, numbers: Integers) -> Integers:
@@ -87,7 +88,7 @@ class ChannelNews(NamedTuple):
 
 
 def glonass_channels(frames: Frames, before: Mapping[int, int]) -> ChannelNews:
-    """Return the channels in `before` and in messages 1020, because MSM4 and MSM6 do not contain channels."""
+    """Return the channels in `before` and in messages 1020. MSM4 and MSM6, which contain no channels, need them."""
     chosen = frames.of("rtcm3", 1020)
     bits = take_bits(frames, chosen, 23)
     known = (np.full(len(before), -1), *np.array([*before.items()], dtype=np.int64).reshape(-1, 2).T)
@@ -155,7 +156,7 @@ def _beidou_time(time: Datetimes, letter: Strings) -> tuple[Datetimes, int]:
 
 
 def _in_rising_weeks(time: Datetimes, glonass: Masks) -> Datetimes:
-    """Shift times by whole weeks to within half a week of the preceding time; skip GLONASS if mixed with others."""
+    """Shift each time by weeks to within half a week of the one before; GLONASS times only if there are no others."""
     counted = np.flatnonzero(~glonass) if not glonass.all() else np.arange(len(time))
     week = np.timedelta64(7, "D").astype("timedelta64[ns]")
     moved = time.copy()
@@ -217,7 +218,7 @@ def find_unfinished_epoch(frames: Frames) -> int | None:
 def _of_number(
     frames: Frames, number: int, near: np.datetime64, channels: ChannelNews
 ) -> Iterator[tuple[Integers, Measurements]]:
-    """Yield offsets and measurements of the messages with one number, for each group with equal masks."""
+    """Yield the offsets and measurements of the messages with one number, in groups of messages with equal masks."""
     chosen = frames.of("rtcm3", number)
     if not len(chosen):
         return
@@ -328,7 +329,7 @@ def _sequence(codings: Mapping[str, Coding], names: str) -> dict[str, Field]:
 
 _ORBIT: Final = "crs delta_n m0 cuc eccentricity cus sqrt_a toe_sow_s cic omega0 cis i0 crc omega omega_dot"
 _GALILEO: Final = f"number week iod accuracy i_dot toc_s af2 af1 af0_s {_ORBIT} group_delay_1_s"
-#: Layouts of ephemeris messages by number, with the fields in the order of transmission.
+#: Layout of each ephemeris message, by message number; fields are in the order of transmission.
 EPHEMERIDES: Final[dict[int, dict[str, Field]]] = {
     1019: _sequence(
         nav_messages.LNAV_CODINGS,
@@ -367,20 +368,21 @@ def ephemeris_fields(frames: Frames) -> Iterator[tuple[int, int, dict[str, float
             yield place, number, {name: float(values[k]) for name, values in table.items()}
 
 
-#: Week field by ephemeris message: GPS week in which the field is first 0, and weeks after which it is 0 again.
+#: For the week field of each ephemeris message, the GPS week in which it was first 0, and its cycle [weeks].
 _WEEKS: Final = {1045: (1024, 4096), 1046: (1024, 4096), 1042: (1356, 8192), 1019: (0, 1024), 1044: (0, 1024)}
 
 
-#: GPS week in which MSM were introduced (July 2011, RTCM 10403.1 amendment 5); no log with MSM is older.
+#: GPS week in which MSM were introduced (July 2011, RTCM 10403.1 amendment 5). No log with MSM is older.
 _FIRST_MSM_WEEK: Final = 1642
 
 
 def ephemeris_date(frames: Frames, near: np.datetime64 | None) -> np.datetime64:
     """Return the median time of a log's ephemerides, from which the week of its observations is resolved, or NaT.
 
-    Only Galileo ephemerides are used if there are any, else BeiDou, whose weeks are also unambiguous, else GPS and
-    QZSS. GPS and QZSS send the week modulo 1024. It is resolved to the week nearest to `near`, or without `near`, to a
-    week from July 2011, when MSM were introduced, to February 2031. The computer's clock is not used.
+    Only Galileo ephemerides are used or, if there are none, BeiDou ephemerides, whose weeks are also unambiguous, else
+    GPS and QZSS ephemerides. These have the week modulo 1024, which is resolved to the week nearest to `near`; without
+    `near`, to the only such week from July 2011, when MSM were introduced, to February 2031. The computer's clock is
+    not used.
     """
     cycle_begin = _FIRST_MSM_WEEK
     if near is not None:

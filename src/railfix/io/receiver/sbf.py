@@ -51,8 +51,8 @@ BDS_RAW_B2A: Final = 4219
 QZS_RAW_L1CA: Final = 4066
 QZS_RAW_L2C: Final = 4067
 QZS_RAW_L5: Final = 4068
-#: Constellation of each block with navigation pages, and its UBX signal numbers by SBF signal number. None means that
-#: the UBX signal number is 0 for all SBF signal numbers.
+#: For each block with navigation pages, the constellation, and the UBX signal number for each SBF signal number. None
+#: means that the UBX signal number is 0 for all SBF signal numbers.
 _PAGES: Final[dict[int, tuple[str, dict[int, int] | None]]] = {
     GPS_RAW_CA: ("G", None),
     QZS_RAW_L1CA: ("J", None),
@@ -68,14 +68,14 @@ _PAGES: Final[dict[int, tuple[str, dict[int, int] | None]]] = {
     GEO_RAW_L1: ("S", None),
     GEO_RAW_L5: ("S", {25: SBAS_L5}),
 }
-_EVEN_BITS, _BDS_BITS = 114, 300  #: Number of bits of an even I/NAV page without tail, and of a BeiDou subframe.
-#: Constellation and RINEX signal by SBF signal number.
+_EVEN_BITS, _BDS_BITS = 114, 300  #: Number of bits of an even I/NAV page without its tail, and of a BeiDou subframe.
+#: Constellation and RINEX signal for each SBF signal number.
 SIGNALS: Final = {
     0: "G1C", 1: "G1W", 2: "G2W", 3: "G2L", 4: "G5Q", 5: "G1L", 6: "J1C", 7: "J2L", 8: "R1C", 9: "R1P", 10: "R2P",
     11: "R2C", 12: "R3Q", 13: "C1P", 14: "C5P", 15: "I5A", 17: "E1C", 19: "E6C", 20: "E5Q", 21: "E7Q", 22: "E8Q",
     24: "S1C", 25: "S5I", 26: "J5Q", 28: "C2I", 29: "C7I", 30: "C6I", 32: "J1L", 33: "J1Z", 34: "C7D", 39: "J5P",
 }  # fmt: skip
-#: Ranges of SVID: first, last, constellation, and the number that is added to obtain the RINEX satellite number.
+#: Ranges of SVID: first and last SVID, constellation, and the number to add to obtain the RINEX satellite number.
 _NUMBERS: Final = (
     (1, 37, "G", 0), (38, 61, "R", -37), (63, 68, "R", -38), (71, 106, "E", -70), (120, 140, "S", -100),
     (141, 180, "C", -140), (181, 187, "J", -180), (191, 197, "I", -190), (198, 215, "S", -157), (223, 245, "C", -182),
@@ -110,14 +110,14 @@ _FRAME: Final = np.dtype(
 _PVT: Final = np.dtype(
     [("tow_ms", "<u4"), ("week", "<u2"), ("mode", "u1"), ("error", "u1"), ("place", "<f8", 3), ("undulation", "<f4")]
 )
-#: RTKLIB quality by PVT block mode. The modes are 1 stand-alone, 2 differential, 3 fixed position, 4 RTK fixed, 5 RTK
-#: float, 6 SBAS, 7 moving base fixed, 8 moving base float, 10 PPP.
+#: RTKLIB quality for each mode of a PVT block. The modes are 1 stand-alone, 2 differential, 3 fixed position, 4 RTK
+#: fixed, 5 RTK float, 6 SBAS, 7 moving base fixed, 8 moving base float, 10 PPP.
 _QUALITY: Final = {1: 5, 2: 4, 3: 1, 4: 1, 5: 2, 6: 3, 7: 1, 8: 2, 10: 6}
 _NO_TIME: Final = 0xFFFFFFFF
 _NO_WEEK: Final = 0xFFFF
-_TIME: Final = np.dtype([("tow_ms", "<u4"), ("week", "<u2")])  #: Time of a block.
-_SCRAMBLED: Final = 0x80  #: Flag of a MeasEpoch with encrypted measurements.
-_WITHOUT_OFFSET: Final = (1, 2)  #: GPS L1P(Y) and L2P(Y), whose C/N0 is sent without the offset of 10 dB-Hz.
+_TIME: Final = np.dtype([("tow_ms", "<u4"), ("week", "<u2")])  #: Time fields at the beginning of each block.
+_SCRAMBLED: Final = 0x80  #: Flag of a MeasEpoch block whose measurements are scrambled; such blocks are skipped.
+_WITHOUT_OFFSET: Final = (1, 2)  #: SBF numbers of GPS L1P(Y) and L2P(Y), to whose C/N0 no 10 dB-Hz are added.
 
 
 def _names() -> Strings:

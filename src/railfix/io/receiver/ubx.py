@@ -18,14 +18,14 @@ from railfix.io.receiver.framing import Frames, Subframes, gather_structures
 from railfix.io.receiver.measurements import Measurements
 
 RXM_RAWX: Final = 0x0215
-#: Raw measurements of older receivers, up to the u-blox 7. They are counted but not read.
+#: Raw measurements of receivers up to the u-blox 7; these messages are counted but not read.
 RXM_RAW: Final = 0x0210
 RXM_SFRBX: Final = 0x0213
 NAV_PVT: Final = 0x0107
 NAV_HPPOSLLH: Final = 0x0114
 
-SYSTEMS: Final = {0: "G", 1: "S", 2: "E", 3: "C", 5: "J", 6: "R", 7: "I"}  #: Constellation letter by gnssId.
-#: RINEX signal by gnssId and sigId (section 1.5.4 of the interface description, "Signal identifiers").
+SYSTEMS: Final = {0: "G", 1: "S", 2: "E", 3: "C", 5: "J", 6: "R", 7: "I"}  #: Constellation letter for each gnssId.
+#: RINEX signal for each gnssId and sigId (section 1.5.4 of the interface description, "Signal identifiers").
 SIGNALS: Final[Mapping[int, Mapping[int, str]]] = {
     0: {0: "1C", 3: "2L", 4: "2S", 6: "5I", 7: "5Q"},
     1: {0: "1C"},
@@ -35,15 +35,14 @@ SIGNALS: Final[Mapping[int, Mapping[int, str]]] = {
     6: {0: "1C", 2: "2C"},
     7: {0: "5A"},
 }
-#: Masks of the data bits in the parity equations of D25 to D30 of an LNAV word.
+#: For each parity bit D25 to D30 of an LNAV word, the mask of the data bits in its parity equation.
 _LNAV_PARITY: Final = (0xEC7CD2, 0x763E69, 0xBB1F34, 0x5D8F9A, 0xAEC7CD, 0x2DEA27)
-#: Indices of the parity equations that contain D29 of the previous word.
-_LNAV_WITH_D29: Final = (0, 2, 5)
-#: Last GPS week that is accepted (2079). A wrong later date would put all other epochs out of order.
+_LNAV_WITH_D29: Final = (0, 2, 5)  #: Indices in `_LNAV_PARITY` of the equations that contain D29 of the previous word.
+#: Epochs after this GPS week (in 2079) are skipped, because a wrong later date would put all other epochs out of order.
 _LAST_WEEK: Final = 5200
-#: Codes [m], phases [cycles] and Dopplers [Hz] are invalid from this value on, because RINEX fields are too short.
+#: Codes [m], phases [cycles] and Dopplers [Hz] of this size or more are rejected: they do not fit into RINEX fields.
 _LARGEST: Final = 1e10
-#: One measurement in RXM-RAWX.
+#: Fields of one measurement in RXM-RAWX.
 _MEASUREMENT: Final = np.dtype(
     [
         ("code", "<f8"), ("phase", "<f8"), ("doppler", "<f4"), ("gnss", "u1"), ("sv", "u1"), ("signal", "u1"),
@@ -52,7 +51,7 @@ _MEASUREMENT: Final = np.dtype(
     ]
 )  # fmt: skip
 _SFRBX_HEADER: Final = np.dtype([*((name, "u1") for name in ("gnss", "sv", "signal", "channel", "count")), ("_", "V3")])
-_WORDS: Final = np.dtype([("words", "<u4", 10)])  #: Words of RXM-SFRBX; at most ten are used.
+_WORDS: Final = np.dtype([("words", "<u4", 10)])  #: Subframe words in RXM-SFRBX; more than ten are ignored.
 _RAWX_HEADER: Final = np.dtype(
     [("tow", "<f8"), ("week", "<u2"), ("leap", "i1"), ("count", "u1"), ("status", "u1"), ("version", "u1"), ("_", "V2")]
 )
@@ -72,7 +71,7 @@ _HPPOSLLH: Final = np.dtype(
     ]
 )  # fmt: skip
 _PHASE_VALID, _HALF_CYCLE_KNOWN, _HALF_CYCLE_REMOVED, _CODE_VALID = 2, 4, 8, 1
-#: Largest standard deviation of a usable phase, as in RTKLIB 2.4.3 [0.004 cycle].
+#: Phases with a larger standard deviation are rejected, as in RTKLIB 2.4.3; in units of 0.004 cycle.
 _LARGEST_PHASE_STD: Final = 5
 
 
@@ -192,7 +191,7 @@ def positions(frames: Frames, near: np.datetime64) -> dict[str, np.ndarray]:
         horizontal, vertical = rows["horizontal"] * 1e-4, rows["vertical"] * 1e-4
         by_tow = dict(zip(pvt["tow_ms"].tolist(), np.where(fixed, quality, -1).tolist(), strict=True))
         quality = np.array([by_tow.get(tow, 5) for tow in rows["tow_ms"].tolist()], dtype=np.int64)
-        kept &= quality > 0  # positions before the first fix are invalid in NAV-PVT
+        kept &= quality > 0  # drop positions before the first fix, which NAV-PVT marks as invalid
     else:
         rows, kept = pvt, fixed
         latitude, longitude = rows["latitude"] * 1e-7, rows["longitude"] * 1e-7

@@ -20,13 +20,12 @@ from railfix.io.rinex.observations_lines import SYSTEMS, SignalColumn, assign_co
 
 #: Time systems that are valid in TIME OF FIRST OBS.
 TIME_SYSTEMS: Final = ("GPS", "GLO", "GAL", "BDT", "QZS", "IRN", "UTC")
-#: Default time system of a file, by constellation letter of the file.
+#: Time system of a file whose header names none, for each constellation letter of a file.
 _DEFAULT_TIME: Final = {"G": "GPS", "R": "GLO", "E": "GAL", "C": "BDT", "J": "QZS", "I": "IRN", "S": "GPS", "M": "GPS"}
-ALL: Final = ""  #: Key of RINEX 2 observation types, which apply to all constellations.
-#: Longest accepted header [bytes].
-_MAX_HEADER_BYTES: Final = 4 << 20
+ALL: Final = ""  #: Key of the RINEX 2 observation types in `RinexHeader.types`; they apply to all constellations.
+_MAX_HEADER_BYTES: Final = 4 << 20  #: A file without END OF HEADER in this number of bytes is rejected.
 VERSION: Final = "RINEX VERSION / TYPE"  #: Label of the first record of a header.
-#: Names of time systems that some programs write, and the names in RINEX.
+#: For each other name of a time system that some programs write, the name in RINEX.
 _OTHER_NAMES: Final = {"GPST": "GPS", "BDS": "BDT", "GLONASS": "GLO", "GALILEO": "GAL", "QZSS": "QZS"}
 
 
@@ -35,11 +34,11 @@ class RinexHeader:
     """Header contents of an observation file."""
 
     version: float
-    system: str  #: Constellation letter of the file, "M" when mixed.
+    system: str  #: Constellation letter of the file; "M" if it may have several constellations.
     time_system: str = "GPS"
-    #: Declared observation types by constellation letter. RINEX 2 files have a single entry, `ALL`.
+    #: Declared observation types for each constellation letter; in a RINEX 2 file, only for the key `ALL`.
     types: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    #: Scale factor (SYS / SCALE FACTOR) by constellation and observation type.
+    #: Scale factor (SYS / SCALE FACTOR) for each constellation letter and observation type; 1 if absent.
     scale: Mapping[tuple[str, str], float] = field(default_factory=dict)
     #: Part of the header that becomes `Observations.header`.
     public: ObservationHeader = field(default_factory=ObservationHeader)
@@ -116,7 +115,7 @@ def read_version(path: FilePath, line: str) -> float:
 def apply_records(
     path: str, header: RinexHeader, lines: Sequence[str], *, first_line: int, log: FaultLog
 ) -> RinexHeader:
-    """Return the header changed by header records; `first_line` is the line number of the first record."""
+    """Return the header updated with the records `lines`; `first_line` is the line number of the first record."""
     reader = _HeaderRecords(path, header, log)
     for number, line in enumerate(lines, start=first_line):
         reader.read(line, number)
@@ -155,9 +154,10 @@ class _HeaderRecords:
                 self._changes |= self._by_words(name, label, text)
 
     def _by_words(self, name: str, label: str, text: str) -> dict[str, Any]:
-        """Return the value of a record, by field name; the fields are separated by spaces instead of columns.
+        """Return the value of a record whose fields are not in their columns, by field name; fields are split at
+        spaces.
 
-        An unreadable record is an error with ``broken_lines="stop"``, or else is noted and skipped.
+        With ``broken_lines="stop"``, an unreadable record is an error; with "count", it is noted and skipped.
         """
         read = _BY_WORDS.get(label)
         try:
@@ -319,7 +319,7 @@ def _interval(text: str) -> float:
     return value if value > 0.0 and math.isfinite(value) else math.nan
 
 
-#: Field of `ObservationHeader`, and function that reads its value, for each record that has one value.
+#: For each record that sets one field of `ObservationHeader`, the field and the function that reads its value.
 _VALUES: Final[Mapping[str, tuple[str, Callable[[str], Any]]]] = {
     "APPROX POSITION XYZ": ("approximate_ecef_m", _place),
     "ANTENNA: DELTA H/E/N": ("antenna_delta_hen_m", _three),
@@ -332,7 +332,7 @@ _VALUES: Final[Mapping[str, tuple[str, Callable[[str], Any]]]] = {
 }
 
 
-#: Functions for records of `_VALUES` in which fields are separated by spaces instead of columns.
+#: Functions that read the value of a record of `_VALUES` from its words, if the fields are not in their columns.
 _BY_WORDS: Final[Mapping[str, Callable[[Sequence[str]], Any]]] = {
     "APPROX POSITION XYZ": lambda words: _place("".join(f"{word:>14}" for word in words[:3])),
     "ANTENNA: DELTA H/E/N": lambda words: _three("".join(f"{word:>14}" for word in words[:3])),

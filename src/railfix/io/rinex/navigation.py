@@ -26,7 +26,7 @@ from railfix.io.rinex.navigation_records import (
     number,
 )
 
-#: Constellation letter by name in IONOSPHERIC CORR (RINEX 3.05, table A5).
+#: Constellation letter for each name in IONOSPHERIC CORR (RINEX 3.05, table A5).
 _ION_LETTER: Final = {"GPS": "G", "BDS": "C", "QZS": "J"}
 
 
@@ -36,7 +36,7 @@ class NavigationContent:
 
     broken_lines: BrokenLines
     records: list[RawRecord] = field(default_factory=list)
-    #: Eight Klobuchar coefficients (four alpha, four beta) by constellation letter.
+    #: Eight Klobuchar coefficients (four alpha, four beta) for each constellation letter.
     klobuchar: dict[str, list[float]] = field(default_factory=dict)
     leap_seconds: int | None = None
     skipped: Counter[str] = field(default_factory=Counter)
@@ -71,7 +71,7 @@ class NavigationContent:
             stored[part] = [0.0 if np.isnan(v) else v for v in values]
 
     def klobuchar_sets(self) -> dict[str, Floats]:
-        """Return the coefficients by constellation. All-zero sets were not received; they are omitted and noted."""
+        """Return the coefficients by constellation. Sets of zeros, which mean "not received", are omitted and noted."""
         received = {}
         for letter, values in self.klobuchar.items():
             if any(values):
@@ -118,19 +118,19 @@ def _header_line(line: str, label: str, content: NavigationContent) -> None:
         content.skipped[f"ionosphere {line[:4].strip()}"] += 1
 
 
-#: Minimum and maximum number of lines of a record, including the epoch line, by constellation (RINEX 2.11, tables A4
-#: and A11; 3.05, tables A6 to A16). GLONASS records since 3.05 have a fifth line of flags, which is not used.
+#: Minimum and maximum number of lines of a record with its epoch line, for each constellation (RINEX 2.11, tables A4
+#: and A11; 3.05, tables A6 to A16). GLONASS records have a fifth line since RINEX 3.05; its flags are not used.
 _LINES: Final = {"G": (8, 8), "J": (8, 8), "E": (8, 8), "C": (8, 8), "R": (4, 5)}
-#: Minimum and maximum number of lines of the messages that RINEX 4 introduced (4.02, tables A10, A11, A18 to A20).
+#: Minimum and maximum number of lines of each message that RINEX 4 introduced (4.02, tables A10, A11, A18 to A20).
 _LINES_4: Final = {"CNAV": (9, 9), "CNV1": (10, 10), "CNV2": (10, 10), "CNV3": (9, 9)}
-#: RINEX 4 message names by constellation.
+#: RINEX 4 names of the messages that are read, for each constellation.
 _MESSAGES: Final = {
     "G": ("LNAV", "CNAV", "CNV2"), "J": ("LNAV", "CNAV", "CNV2"), "E": ("INAV", "FNAV"),
     "C": ("D1", "D2", "CNV1", "CNV2", "CNV3"), "R": ("FDMA",),
 }  # fmt: skip
-#: Constellation of records without a letter, by file type (RINEX 2.11, 2.12, 3.00).
+#: Constellation of satellites written without a letter, for each file type (RINEX 2.11, 2.12, 3.00).
 _FILE_SYSTEMS: Final = {"N": "G", "G": "R", "H": "S", "E": "E", "L": "E", "J": "J"}
-_SKIPPED: Final = ("S", "I")  #: Constellations whose records are skipped: SBAS, NavIC.
+_SKIPPED: Final = ("S", "I")  #: Constellations whose records are skipped and counted: SBAS, NavIC.
 _WIDTH: Final = 19  #: Width of a number [characters].
 #: Record title (RINEX 4.02, table A7), such as ``> EPH G01 LNAV``. Time offsets (STO) may lack the satellite number.
 _TITLE: Final = re.compile(r"> *([A-Z]{3}) +([A-Z](?:[ \d]\d)?) *(\S*)")
@@ -140,7 +140,7 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop") -> Navi
     """Read all records of one or several navigation files, plain or compressed.
 
     With "count", a malformed record is counted in `skipped` and described in `notes`. Raise InputFileError if a file is
-    missing or no navigation file, no file has a usable record, or (with "stop") a record is malformed.
+    missing or is not a navigation file, if no file has a usable record, or, with "stop", if a record is malformed.
     """
     files = path_names(paths)
     content = NavigationContent(broken_lines=broken_lines)
@@ -165,11 +165,11 @@ def read_navigation(paths: Paths, *, broken_lines: BrokenLines = "stop") -> Navi
 class _Block:
     """Lines of one record."""
 
-    line: int  #: Number of the first line in the file, from 1.
+    line: int  #: Line number of the record's first line in the file.
     name: str  #: Satellite name as written in the file.
-    message: str  #: Message name, empty before RINEX 4.
-    text: list[str]  #: Text of the lines.
-    last: bool = False  #: Whether this is the last record of the file, which may be incomplete.
+    message: str  #: Message name as in the record's title; blank before RINEX 4, which has no titles.
+    text: list[str]  #: Lines of the record, without a title.
+    last: bool = False  #: Whether the record is the last of the file; the last record may be incomplete.
 
 
 def _read_file(path: FilePath, content: NavigationContent) -> None:
@@ -192,7 +192,7 @@ def _read_file(path: FilePath, content: NavigationContent) -> None:
 
 
 def _blocks(path: FilePath, lines: list[str], begin: int, version: float, kind: str) -> Iterator[_Block]:
-    """Yield the records of a version 2 or 3 file. Only the first line of a record does not begin with blanks."""
+    """Yield the records of a version 2 or 3 file. All lines of a record except the first begin with blanks."""
     starts = [i for i in range(begin, len(lines)) if lines[i][:3].strip()]
     _reject_stray(path, lines, begin, starts)
     letter = _FILE_SYSTEMS[kind] if version < 3.0 else ""
@@ -258,7 +258,7 @@ def _record(path: FilePath, block: _Block, version: float, content: NavigationCo
         content.skipped[f"{system} {block.message}".strip()] += 1
         return None
     fewest, most = _LINES_4.get(block.message, _LINES[system])
-    # Blank lines after the record are ignored; further lines with fields are a fault.
+    # Blank lines after the record are ignored; more lines with fields than expected are a fault.
     count = next((k for k in range(len(block.text), fewest, -1) if block.text[k - 1].strip()), fewest)
     count = min(count, len(block.text))
     if not fewest <= count <= most:
@@ -267,7 +267,7 @@ def _record(path: FilePath, block: _Block, version: float, content: NavigationCo
             path, f"record of {satellite} has {count} lines, {fewest} were expected; {fault}", line=block.line
         )
     first = block.text[0]
-    lettered = version >= 3.0 or first[:1].isalpha()  # a letter, allowed in RINEX 2.12, shifts all columns by one
+    lettered = version >= 3.0 or first[:1].isalpha()  # a letter (as in RINEX 2.12) shifts all columns by one
     try:
         epoch = _instant(first[4:], 4) if version >= 3.0 else _instant(first[2 + lettered :], 3)
     except ValueError:

@@ -14,7 +14,7 @@ from railfix.core.nearest_times import nearest_day, nearest_week
 from railfix.core.timescale import bdt_to_gpst, seconds, to_week, utc_to_gpst
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords
 
-#: Names of the numbers in a Keplerian record, in file order, beginning with three clock coefficients.
+#: Names of the numbers in an LNAV, INAV, FNAV, D1 or D2 record, in file order, beginning with three clock coefficients.
 _KEPLER: Final = (
     "af0_s af1 af2 iode crs delta_n m0 cuc eccentricity cus sqrt_a toe_sow_s cic omega0 cis i0 crc omega omega_dot "
     "i_dot data_source week flag accuracy_m health group_delay_1_s group_delay_2_s transmitted fit"
@@ -36,7 +36,7 @@ _CNAV: Final = _ORBIT_4.format("top") + (
 )
 _CNV: Final = _ORBIT_4.format("toe_sow_s") + "kind top sisai_oe sisai_ocb sisai_oc1 sisai_oc2 "
 _CNV_END: Final = " group_delay_1_s group_delay_2_s sismai health flags iodc transmitted spare spare iode"
-#: Names of the numbers in messages that RINEX 4 introduced (4.02, tables A10, A11, A18 to A20).
+#: Names of the numbers in each message that RINEX 4 introduced (4.02, tables A10, A11, A18 to A20).
 _MESSAGES_4: Final[Mapping[str, str]] = {
     **dict.fromkeys(("G CNAV", "J CNAV"), _CNAV + "transmitted week"),
     **dict.fromkeys(("G CNV2", "J CNV2"), _CNAV + "inter_signal_4 inter_signal_5 spare spare transmitted week"),
@@ -44,19 +44,19 @@ _MESSAGES_4: Final[Mapping[str, str]] = {
     "C CNV2": _CNV + "spare inter_signal_1" + _CNV_END,
     "C CNV3": _CNV + "sismai health flags group_delay_1_s transmitted",
 }
-#: Names of the numbers in a record by constellation, or by constellation and message if the message differs.
+#: Names of the numbers in each message that RINEX 4 introduced ("G CNAV"), and in other messages of each constellation.
 FIELDS: Final[Mapping[str, Sequence[str]]] = {
     **dict.fromkeys("GJEC", _KEPLER),
     "R": _GLONASS,
     **{message: names.split() for message, names in _MESSAGES_4.items()},
 }
-#: Numbers without which orbit or clock cannot be computed.
+#: Numbers without which orbit or clock cannot be computed; a record in which one is blank is rejected.
 _NEEDED: Final = frozenset(
     "af0_s sqrt_a eccentricity m0 toe_sow_s omega0 i0 omega omega_dot "
     "clock_bias x x_velocity y y_velocity z z_velocity".split()
 )
-#: Lower and upper limits of plausible numbers. The limits of `sqrt_a` correspond to semi-major axes of about 10 000 to
-#: 70 000 km.
+#: Lower and upper limits of plausible numbers; a record with a number beyond them is rejected. The limits of `sqrt_a`
+#: correspond to semi-major axes of about 10 000 to 70 000 km.
 _BETWEEN: Final[Mapping[str, tuple[float, float]]] = {
     "sqrt_a": (3.1e3, 8.4e3),
     "eccentricity": (0.0, 0.3),
@@ -77,10 +77,10 @@ _BETWEEN: Final[Mapping[str, tuple[float, float]]] = {
         for name in names.split()
     },
 }
-_OTHERS_BETWEEN: Final = (-1e10, 1e10)  #: Limits of all other numbers.
+_OTHERS_BETWEEN: Final = (-1e10, 1e10)  #: Limits of all numbers that are not in `_BETWEEN`.
 _BLANK: Final = float("nan")
-_UNKNOWN: Final = 0.99e9  #: Magnitudes between this value and 1.01E9 mean an unknown number (0.9999E9 in RINEX).
-_TRANSMISSION_S: Final = 2 * 86_400.0  #: Largest valid difference between transmission time and toe [s].
+_UNKNOWN: Final = 0.99e9  #: A magnitude between this and 1.01E9 means an unknown number (0.9999E9 in RINEX).
+_TRANSMISSION_S: Final = 2 * 86_400.0  #: A transmission time further than this from toe is read as unknown [s].
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class RawRecord:
     system: str
     satellite: str
     message: str
-    epoch: np.datetime64  #: Clock reference time in the constellation's time system (UTC for GLONASS).
+    epoch: np.datetime64  #: Clock reference time (toc) in the constellation's time system (UTC for GLONASS).
     numbers: list[float]  #: Numbers of the record in RINEX order (`fields`); NaN where blank.
     version: float
 
@@ -106,7 +106,7 @@ def list_fields(system: str, message: str) -> Sequence[str]:
 
 
 def number(text: str) -> float:
-    """Parse a FORTRAN number. Blank and 0.9999E9 return the same NaN object, so that equal records compare equal.
+    """Parse a FORTRAN number. Blank and 0.9999E9 are read as the same NaN object, so that equal records compare equal.
 
     Raise ValueError if the text is not a finite number.
     """
@@ -203,7 +203,7 @@ def _integers(values: Floats) -> Integers:
 
 
 def _messages(raw: Sequence[RawRecord], system: Strings, source: Integers, satellite: Strings) -> Strings:
-    """Return the message names, derived before RINEX 4 from Galileo data source and BeiDou GEO numbers."""
+    """Return the message names; if a record has none, from the Galileo data source or the BeiDou satellite number."""
     number = np.array([int(s[1:]) for s in satellite.tolist()], dtype=np.int64)
     geo = (number <= 5) | (number >= 59)
     fnav = ((source & 0b010) != 0) & ((source & 0b101) == 0)
@@ -215,7 +215,7 @@ def _messages(raw: Sequence[RawRecord], system: Strings, source: Integers, satel
 
 
 def _fit_interval(system: Strings, fit: Floats) -> Floats:
-    """Return the fit interval [h], NaN except for GPS (0 means 4 h, 1 means 6 h) and QZSS (0: 2 h, 1: 4 h)."""
+    """Return the fit interval [h] of GPS (0 means 4 h, 1 means 6 h) and QZSS (0 means 2 h, 1 means 4 h), else NaN."""
     fit = np.nan_to_num(fit)
     gps = np.where(fit == 0, 4.0, np.where(fit == 1, 6.0, fit))
     qzss = np.where(fit == 0, 2.0, np.where(fit == 1, 4.0, fit))

@@ -20,15 +20,15 @@ from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 from railfix.io.rinex.navigation_records import FIELDS
 from railfix.io.rinex.write import Packing, RinexVersion, header_line, open_target, program_line
 
-UNKNOWN_S: Final = 0.9999e9  #: Value written for unknown numbers.
-_IONOSPHERE: Final = {"G": "GPS", "J": "QZS", "C": "BDS"}  #: Name of the Klobuchar coefficients by constellation.
-#: Messages whose Keplerian records can be written, by RINEX version.
+UNKNOWN_S: Final = 0.9999e9  #: Value that is written for unknown numbers.
+_IONOSPHERE: Final = {"G": "GPS", "J": "QZS", "C": "BDS"}  #: Constellation name in IONOSPHERIC CORR.
+#: For each RINEX version, the messages whose Keplerian records can be written.
 _WRITTEN: Final[dict[RinexVersion, tuple[str, ...]]] = {
     "3.04": ("LNAV", "INAV", "FNAV", "D1", "D2"),
     "4.02": ("LNAV", "INAV", "FNAV", "D1", "D2", "CNV1"),
 }
 _BLANK: Final = " " * 19
-#: Last line of a version 4 GLONASS record (flags, group delay, accuracy); `GlonassRecords` lacks these values.
+#: Last line of a version 4 GLONASS record (flags, group delay, accuracy): unknown, as `GlonassRecords` lacks these.
 _GLONASS_STATUS: Final = f"    {_BLANK}{'.999999999999E+09':>19}{_BLANK}{_BLANK}".rstrip() + "\n"
 
 
@@ -53,7 +53,8 @@ def write_navigation(
     packing : {"plain", "gz"}, optional
         Default: "gz" if the file name ends in ``.gz``, else "plain".
     version : {"3.04", "4.02"}
-        Version 4 files name the message of each record, and have the ionospheric coefficients in records.
+        Version 4 files name the message of each record, and have the ionospheric coefficients in records, not the
+        header.
     comments : sequence of str
         Comment lines of at most 60 ASCII characters.
     created : datetime64, optional
@@ -62,7 +63,7 @@ def write_navigation(
     Raises
     ------
     ValueError
-        `packing` is Hatanaka, which exists for observations only, or a record cannot be written in this version.
+        `packing` is Hatanaka, which is for observations only; or a record cannot be written in this version.
     OutputError
         The file cannot be written.
     """
@@ -201,7 +202,7 @@ def _week_and_transmission(
     """Return the week number of toe in the constellation's time, and the transmission time in seconds of this week."""
     week, _ = to_week(records.toe + shift)
     origin = np.where(beidou, BDT_EPOCH, GPS_EPOCH)
-    # GPS weeks and BeiDou weeks both begin on a Sunday.
+    # The numbers of GPS and BeiDou weeks differ by a constant, because both begin on a Sunday.
     own = week - np.asarray((origin - GPS_EPOCH) // np.timedelta64(7, "D"), dtype=np.int64)
     start = GPS_EPOCH + (week * SECONDS_PER_WEEK).astype("timedelta64[s]")
     sent = seconds(records.transmitted + shift - start)

@@ -33,12 +33,12 @@ from railfix.io.rinex.observations_epochs import (
 )
 from railfix.io.rinex.observations_lines import SYSTEMS, EpochHeads, Lines, split_lines
 
-#: Bytes of text that are decoded at a time: many lines for array operations, but not more than the processor's cache.
+#: Bytes of text that are decoded at a time: many lines for efficient array operations, but few for the cache.
 BLOCK_BYTES: Final = 4 << 20
-#: Longest accepted line [bytes]. Lines that a failing recorder filled with zeros are shorter.
+#: A file with a longer line is rejected [bytes]. Lines of zero bytes from a failing recorder are shorter.
 _MAX_LINE_BYTES: Final = 8 << 20
 _BLANKS: Final = b" " * PADDING
-#: Conversions to GPS time; other time systems equal GPS time.
+#: Functions that convert time systems to GPS time; times in other systems are taken as GPS time.
 _TO_GPST: Final = {"GLO": utc_to_gpst, "UTC": utc_to_gpst, "BDT": bdt_to_gpst}
 _BEFORE_ALL: Final = np.iinfo(np.int64).min
 
@@ -48,9 +48,9 @@ class Selection:
     """Part of a log to read, and treatment of malformed lines."""
 
     broken_lines: BrokenLines = "stop"
-    systems: frozenset[str] | None = None  #: Constellation letters; None means all.
-    start_ns: int = _BEFORE_ALL  #: Earliest time that is read, GPS time since 1970 [ns].
-    end_ns: int = int(np.iinfo(np.int64).max)  #: Only times before it are read [ns].
+    systems: frozenset[str] | None = None  #: Letters of the constellations to read; None means all.
+    start_ns: int = _BEFORE_ALL  #: Epochs before this time are skipped, GPS time since 1970 [ns].
+    end_ns: int = int(np.iinfo(np.int64).max)  #: Epochs at or after this time are skipped, GPS time since 1970 [ns].
 
 
 class BlockReader:
@@ -181,12 +181,11 @@ class BlockReader:
         return self.path, observations, lines.number[epochs.line]
 
 
-#: Default number of epochs of a piece.
+#: Default number of epochs in a piece of the observations.
 DEFAULT_EPOCHS: Final = 3600
 _PEEK_BYTES: Final = 1 << 16
-#: Ratio of the length of a piece to the length of the first piece.
-_FIRST_PART: Final = 5
-_GAP_INTERVALS: Final = 1.5  #: A longer time between two files is a gap [observation intervals].
+_FIRST_PART: Final = 5  #: Ratio of the number of epochs in a piece to the number in the first piece.
+_GAP_INTERVALS: Final = 1.5  #: A time between two files that exceeds this number of observation intervals is a gap.
 
 
 def scan_observations(
@@ -201,9 +200,9 @@ def scan_observations(
 ) -> Iterator[Observations]:
     """Return an iterator over the observations of one receiver in pieces of at most `epochs` epochs.
 
-    The other arguments are as in `railfix.read_observations`. The first piece is shorter (`in_pieces`). Each piece has
-    only the channels that occur in it. At any time, only one piece and one block of text are in memory. `progress` is
-    called with the fraction of the files that has been read, 0 to 1.
+    Arguments that are not described here are as in `railfix.read_observations`. The first piece is shorter
+    (`in_pieces`). Each piece has only the channels that occur in it. At any time, only one piece and one block of text
+    are in memory. `progress` is called with the fraction of the files that has been read, 0 to 1.
     """
     if epochs < 1:
         raise ValueError(f"a piece has at least one epoch, epochs={epochs} was requested")
@@ -268,7 +267,7 @@ def _of_files(
             raise InputFileError(reader.path, "has a header but no epochs; the recording is empty or cut short")
 
 
-#: Longest time between the first epochs of consecutive files of one run.
+#: Files are not of one run if the first epochs of two consecutive files are further apart than this.
 LONGEST_GAP: Final = np.timedelta64(7, "D")
 
 
@@ -318,7 +317,7 @@ def in_pieces(runs: Iterator[Observations], epochs: int) -> Iterator[Observation
         if length <= size:
             continue
         joined, at = concatenate(waiting), 0
-        while length > size:  # the last piece waits: it gets the problems found at the file end
+        while length > size:  # the last piece is held back, to report problems found at the file's end
             piece = without_empty_channels(joined[at : at + size])
             if at == 0:
                 problems, count = joined.problems, joined.problem_count

@@ -25,7 +25,7 @@ from railfix.io.rinex.observations_lines import KINDS, SYSTEMS, EpochHeads, Line
 
 Words = NDArray[np.uint64]
 
-FIELD_WIDTH: Final = 16  #: Number of characters per field.
+FIELD_WIDTH: Final = 16  #: Number of characters of an observation, with its two indicators.
 #: Number of blanks that must follow a block, because fields are also loaded beyond the end of short lines.
 PADDING: Final = 2048
 
@@ -36,15 +36,15 @@ _BLANKS: Final = _U(0x2020202020202020)
 _NUMBER: Final = re.compile(r" *[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d{1,2})?")
 _DIGIT_OR_BLANK: Final = re.compile("[ 0-9]{2}")
 
-#: Bit masks for the first n characters of a field, n from 0 to 16, shape (17, 2).
+#: Bit masks that keep the first n characters of a field, in two words, n from 0 to 16; shape (17, 2).
 _KEEP: Final = np.array(
     [[(1 << 8 * min(n, 8)) - 1, (1 << 8 * max(n - 8, 0)) - 1] for n in range(FIELD_WIDTH + 1)], dtype=np.uint64
 )
 
 
 def gather(data: Bytes, start: Integers, length: Integers, count: int) -> Words:
-    """Return `count` fields of each line as pairs of little-endian 64-bit words, shape (n, count, 2), blank beyond a
-    line.
+    """Return `count` fields of each line as pairs of little-endian 64-bit words, shape (n, count, 2); characters beyond
+    the end of a line are blanks.
     """
     width = FIELD_WIDTH * count
     if width > PADDING:
@@ -101,9 +101,9 @@ def _read_slowly(flat: Words) -> tuple[Floats, Masks]:
 
 _BLANK: Final = ord(" ")
 _ZERO: Final = ord("0")
-NAMES_PER_LINE: Final = 12  #: Number of satellite names on a RINEX 2 epoch line.
-_FIRST_NAME: Final = 32  #: Column of the first satellite name on a RINEX 2 epoch line.
-#: Number of observations on a RINEX 2 line.
+NAMES_PER_LINE: Final = 12  #: Number of satellite names on a full RINEX 2 epoch line.
+_FIRST_NAME: Final = 32  #: Column of the first satellite name on a RINEX 2 epoch line, from 0.
+#: Number of observations on a full RINEX 2 line.
 FIELDS_PER_LINE: Final = 5
 _LETTERS: Final = range(ord("A"), ord("Z") + 1)
 
@@ -112,10 +112,10 @@ _LETTERS: Final = range(ord("A"), ord("Z") + 1)
 class DecodedRows:
     """Satellites of consecutive epochs, one row per satellite and epoch, n rows."""
 
-    epoch: Integers  #: Index of the epoch, shape (n,).
+    epoch: Integers  #: Index of the satellite's epoch, shape (n,).
     letter: Bytes  #: Constellation letter as ASCII code, shape (n,).
-    number: Integers  #: Satellite number, -1 if unreadable; shape (n,).
-    line: Integers  #: Index of the first observation line of the satellite in `Lines`, shape (n,).
+    number: Integers  #: Satellite number; -1 if the satellite's name cannot be read, shape (n,).
+    line: Integers  #: Index in `Lines` of the satellite's first observation line, shape (n,).
 
     def __getitem__(self, which: Masks | Integers) -> DecodedRows:
         return take_rows(self, which)

@@ -39,7 +39,7 @@ class FaultLog:
     def __init__(self, path: str, *, broken_lines: BrokenLines) -> None:
         self.path = path
         self.stops = broken_lines == "stop"
-        self.last_line = 0  #: Number of the last line of the file; 0 until it has been read.
+        self.last_line = 0  #: Line number of the last line of the file; 0 until this line has been read.
         self.counts: dict[str, int] = {}
         self._messages: list[str] = []
         self._problems = 0
@@ -62,7 +62,7 @@ class FaultLog:
             self._messages.append(f"{self.path}, line {line}: {message}; {_CONSEQUENCE[kind]}")
 
     def faults(self, kind: str, lines: Integers, message: Callable[[int], str]) -> None:
-        """Record faults of one kind at ascending line numbers. Only the first are described, by `message(i)`."""
+        """Record faults of one kind at ascending line numbers. The first few are described by `message(i)`."""
         described = 1 if self.stops else MAX_PROBLEMS
         for i, line in enumerate(lines[:described].tolist()):
             self.fault(kind, line, message(i))
@@ -71,12 +71,12 @@ class FaultLog:
         self._problems += rest
 
     def note(self, message: str) -> None:
-        """Count a malformed header record, and store the complete message about it."""
+        """Count a malformed header record, and store `message`, which already names file and line."""
         self.count(RECORDS, 1)
         self.remark(message)
 
     def remark(self, message: str) -> None:
-        """Store the complete message about a deviation from the format by which no data are lost."""
+        """Store `message`, with file and line, about an error in the format that causes no loss of data."""
         self._problems += 1
         if len(self._messages) < MAX_PROBLEMS:
             self._messages.append(message)
@@ -102,13 +102,13 @@ class FaultLog:
             raise InputFileError(self.path, f"{self._first[1]}; {LENIENT}", line=self._first[0])
 
     def take(self) -> tuple[tuple[str, ...], int, dict[str, int]]:
-        """Return the messages, the number of faults and the counts since the last call."""
+        """Return the messages, the number of faults and the counts that were added since the last call."""
         taken = (first_problems(self._messages, count=self._problems), self._problems, self.counts)
         self._messages, self._problems, self.counts = [], 0, {}
         return taken
 
 
-#: Labels of header records; such records are among the epochs if files were concatenated or edited.
+#: Labels of header records. Lines with such a label occur among the epochs if files were concatenated or edited.
 LABELS: Final = frozenset(
     (
         "COMMENT", "RINEX VERSION / TYPE", "END OF HEADER", "PGM / RUN BY / DATE", "MARKER NAME", "MARKER NUMBER",
@@ -122,7 +122,7 @@ LABELS: Final = frozenset(
         "PRN / # OF OBS",
     )
 )  # fmt: skip
-#: Upper limit on the number of lines of an epoch, which has fewer than 1000 satellites.
+#: An epoch has fewer lines than this, because it has fewer than 1000 satellites.
 _MAX_LINES = 1100 * 6
 _CUT_EPOCH_LINE = "the file ends in the middle of an epoch, in its first line"
 
@@ -183,7 +183,7 @@ def _find_marked(lines: Lines, *, version: float, at_end: bool, log: FaultLog) -
 
 
 def _records_after(lines: Lines, head: EpochHeads, room: Integers, log: FaultLog) -> dict[int, tuple[int, int, int]]:
-    """Return the header records that follow an epoch, as events (line, flag, count) by index of the epoch."""
+    """Return, for the index of each epoch that header records follow, these records as an event (line, flag, count)."""
     records: dict[int, tuple[int, int, int]] = {}
     for k in np.flatnonzero((head.flaw == 0) & (room > head.count)).tolist():
         first, end = int(head.line[k] + 1 + head.count[k]), int(head.line[k] + 1 + room[k])
@@ -219,7 +219,7 @@ def _is_record(lines: Lines, line: int) -> bool:
 
 
 def _find_unmarked(lines: Lines, *, lines_per_satellite: int, at_end: bool, log: FaultLog) -> tuple[EpochHeads, int]:
-    """Find RINEX 2 epochs by the decimal point of the seconds. Other lines have no point in its column."""
+    """Find RINEX 2 epochs by the decimal point of the seconds, because other lines have no point in this column."""
     n = len(lines)
     long = np.flatnonzero(lines.length >= epoch_width(2.0))
     likely = long[lines.data[lines.start[long] + 18] == ord(".")]
@@ -249,7 +249,7 @@ class _Walk:
         self._events: list[tuple[int, int, int]] = []
 
     def run(self, stop: int, *, at_end: bool) -> tuple[EpochHeads, int]:
-        """Walk from line 0 to `stop`; return the same as `find_epochs`."""
+        """Walk from line 0 to `stop`; return the epochs and events, and the number of lines that were read."""
         position = 0
         while position < stop:
             k = int(np.searchsorted(self._line, position))
@@ -263,8 +263,8 @@ class _Walk:
         return _with_events(self._head[self._kept], self._events), position
 
     def _run_of_epochs(self, k: int, stop: int, *, at_end: bool) -> int:
-        """Keep the epochs from the k-th to the next gap or malformed epoch; return the line where the walk
-        continues.
+        """Keep the epochs from the k-th until one whose lines do not end where the next epoch line begins; return the
+        line where the walk continues.
         """
         later = self._breaks[np.searchsorted(self._breaks, k) :]
         last = int(later[0]) if len(later) else len(self._line) - 1

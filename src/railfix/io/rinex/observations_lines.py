@@ -1,9 +1,10 @@
 """Split text into lines, parse epoch lines, and find the signals of RINEX observation types.
 
 In RINEX 3 and 4, an observation type names the signal ("C1C" is the code of "1C"). In RINEX 2, a type names only the
-band (RINEX 2.11, table A1; RINEX 3.05, tables 4 to 11). L1, D1 and S1 are assigned to the signal of C1, or to that of
-P1 if only P1 is declared. L2, D2 and S2 are assigned to the signal of P2, or to that of C2 if only C2 is declared. The
-BeiDou signals 1I and 1Q, and 1X in RINEX 3.02, are read as 2I, 2Q and 2X, because RINEX 3.02 names B1 band 1.
+band (RINEX 2.11, table A1; RINEX 3.05, tables 4 to 11). L1, D1 and S1 are assigned to the signal of C1, or to the
+signal of P1 if only P1 is declared. L2, D2 and S2 are assigned to the signal of P2, or to the signal of C2 if only C2
+is declared. The BeiDou signals 1I and 1Q, and 1X in RINEX 3.02, are read as 2I, 2Q and 2X, because B1 is band 1 in
+RINEX 3.02.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ class Lines:
     """Lines of a block of text."""
 
     data: Bytes  #: Text of the block, followed by blanks, because fixed columns may extend beyond the last line.
-    start: Integers  #: Start of each line, shape (n,).
+    start: Integers  #: Offset of each line in `data`, shape (n,).
     length: Integers  #: Length of each line without the line end (LF or CR LF), shape (n,).
-    stop: Integers  #: Start of the next line, shape (n,).
-    number: Integers  #: Line numbers in the decompressed file, from 1; shape (n,).
+    stop: Integers  #: Offset in `data` of the line after each line, shape (n,).
+    number: Integers  #: Line number of each line in the decompressed file, from 1; shape (n,).
 
     def __len__(self) -> int:
         return len(self.start)
@@ -55,7 +56,7 @@ class Lines:
 
 
 def split_lines(text: bytes, *, first_number: int, keep_blank: bool) -> Lines:
-    """Split a block, which `PADDING` blanks follow, into lines. Empty lines are kept if `keep_blank` (RINEX 2)."""
+    """Split a block, which ends with `PADDING` blanks, into lines. Empty lines are kept if `keep_blank` (RINEX 2)."""
     data = np.frombuffer(text, dtype=np.uint8)
     end = kernels.reading.line_ends(data)
     start = np.concatenate([np.zeros(min(len(end), 1), dtype=np.int64), end[:-1] + 1])
@@ -73,11 +74,11 @@ def split_lines(text: bytes, *, first_number: int, keep_blank: bool) -> Lines:
 class EpochHeads:
     """Epoch lines and events of a block, n rows."""
 
-    line: Integers  #: Index of the epoch line in `Lines`, shape (n,).
-    flag: Integers  #: Epoch flag, -1 if it cannot be read; shape (n,).
-    count: Integers  #: Number of satellites or header records, -1 if unreadable; shape (n,).
-    time_ns: Integers  #: Time since 1970 in the file's time system [ns], 0 for events; shape (n,).
-    flaw: Integers  #: Fault as an index into `FLAWS`, 0 for a valid line; shape (n,).
+    line: Integers  #: Index in `Lines` of the epoch line, shape (n,).
+    flag: Integers  #: Epoch flag; -1 if it cannot be read, shape (n,).
+    count: Integers  #: Number of satellites, or of header records of an event; -1 if it cannot be read, shape (n,).
+    time_ns: Integers  #: Epoch since 1970 in the file's time system [ns]; 0 for events and invalid lines, shape (n,).
+    flaw: Integers  #: Fault of the epoch line, as an index into `FLAWS`; 0 if the line is valid, shape (n,).
 
     def __len__(self) -> int:
         return len(self.line)
@@ -197,11 +198,11 @@ def event_line(lines: Lines, line: int) -> tuple[int, int] | None:
     return int(flag), int(count)
 
 
-SYSTEMS: Final = "CEGIJRS"  #: RINEX constellation letters.
-#: Field of `Observations` by the first letter of the observation type.
+SYSTEMS: Final = "CEGIJRS"  #: Letters of the constellations that RINEX defines.
+#: Field of `Observations` for each first letter of an observation type.
 KINDS: Final = {"C": "code_m", "L": "phase_cycles", "D": "doppler_hz", "S": "cn0_dbhz"}
 
-#: Signals of RINEX 2 codes by constellation.
+#: Signal of each RINEX 2 code observation, for each constellation.
 _CODES_2: Final[dict[str, dict[str, str]]] = {
     "G": {"C1": "1C", "P1": "1W", "C2": "2X", "P2": "2W", "C5": "5X", "CA": "1C", "CB": "1X", "CC": "2X"},
     "R": {"C1": "1C", "P1": "1P", "C2": "2C", "P2": "2P", "CA": "1C", "CD": "2C"},
@@ -211,7 +212,7 @@ _CODES_2: Final[dict[str, dict[str, str]]] = {
     "S": {"C1": "1C", "C5": "5X", "CA": "1C"},
     "I": {"C5": "5A", "C9": "9A"},
 }
-#: Codes whose signal a RINEX 2 phase, Doppler or C/N0 is assigned to, by band. The first declared code is used.
+#: Codes of each RINEX 2 band; the signal of phase, Doppler and C/N0 is that of the first code that is declared.
 _OWNERS_2: Final[dict[str, tuple[str, ...]]] = {"1": ("C1", "P1"), "2": ("P2", "C2")}
 
 
@@ -219,11 +220,11 @@ _OWNERS_2: Final[dict[str, tuple[str, ...]]] = {"1": ("C1", "P1"), "2": ("P2", "
 class SignalColumn:
     """Column of one observation type in satellite lines."""
 
-    index: int  #: Index of the type among the declared types.
+    index: int  #: Index of the column among the declared observation types.
     name: str  #: Observation type as declared in the header, such as "C1C".
-    kind: int  #: Index in `KINDS` of the array for the type.
-    signal: str  #: Signal of the type, such as "1C".
-    divisor: float  #: Scale factor by which values are divided (SYS / SCALE FACTOR).
+    kind: int  #: Index in `KINDS` of the kind of observation.
+    signal: str  #: Signal of the observation type, such as "1C".
+    divisor: float  #: Scale factor (SYS / SCALE FACTOR) by which the values are divided.
 
 
 def find_signal(name: str, *, system: str, version: float, declared: Sequence[str]) -> str | None:

@@ -111,11 +111,11 @@ def program_line(created: np.datetime64 | None) -> str:
     return header_line(f"{PROGRAM:<20}{'':20}{date:<20}", "PGM / RUN BY / DATE")
 
 
-_BLOCK_EPOCHS: Final = 1024  #: Number of epochs that are formatted together.
+_BLOCK_EPOCHS: Final = 1024  #: Number of epochs that are formatted at a time.
 _EPOCH_WIDTH: Final = 36  #: Number of bytes of an epoch line, including the line end.
 _FIELD_WIDTH: Final = 16  #: Number of bytes of an observation (F14.3, LLI, SSI).
 _BLANK: Final = ord(" ")
-#: Four ASCII digits of each number from 0 to 9999.
+#: Four ASCII digits of each number from 0 to 9999, shape (10000, 4).
 _FOUR: Final = (np.arange(10_000)[:, None] // (1000, 100, 10, 1) % 10 + ord("0")).astype(np.uint8)
 
 
@@ -247,7 +247,7 @@ class _WrittenRows:
 
     satellites: tuple[str, ...]
     columns: tuple[str, ...]
-    channel: Indices  #: Channel of each satellite and column, -1 where absent; shape (S, K).
+    channel: Indices  #: Index of the channel of each satellite and column; -1 where there is none, shape (S, K).
 
 
 def _rows(piece: Observations, columns: Mapping[str, Sequence[str]]) -> list[_WrittenRows]:
