@@ -306,8 +306,10 @@ def release(
     """
     if not state.stopped:
         return state, (), "there is no stop to release"
+    if (age_s := now_s - state.complete_s) > limits.late_s:
+        return state, (), f"the last fixes are {age_s:.1f} s old; a release requires fixes within {limits.late_s:g} s"
     healthy = 0.0 if state.healthy_since_s is None else now_s - state.healthy_since_s
-    if healthy < limits.healthy_s or now_s - state.complete_s > limits.late_s:
+    if healthy < limits.healthy_s:
         return state, (), f"fixes are healthy for {healthy:.0f} s; a release requires {limits.healthy_s:.0f} s"
     return replace(state, stopped=False, cause=None, receiver=-1), (Order.RESUME,), None
 
