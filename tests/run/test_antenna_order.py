@@ -116,6 +116,6 @@ def test_the_run_says_unasked_that_its_logs_are_exchanged(tmp_path: Path, exchan
     words += ["--start", "2024-03-05T03:10:30", "--end", "2024-03-05T03:11:00", "--chunk", "100"]
     result = CliRunner().invoke(app, [str(word) for word in words])
     assert result.exit_code == 0, result.output
-    notes = [note for note in json.loads((tmp_path / "out" / "run.json").read_text())["notes"] if "exchanged" in note]
+    notes = [note for note in json.loads((tmp_path / "out" / "run.json").read_text())["notes"] if "swapped" in note]
     assert len(notes) == exchanged
-    assert ("exchanged" in result.output) == exchanged
+    assert ("swapped" in result.output) == exchanged
