@@ -72,7 +72,6 @@ def test_epochs_without_a_satellite_of_two_antennas(epochs: dict[str, Observatio
     assert_live_is_run({"front": log_of(front), "rear": log_of(rear)}, tmp_path)
 
 
-@pytest.mark.slow
 def test_logs_that_begin_apart(epochs: dict[str, Observations], tmp_path: Path) -> None:
     """The rear log begins 15 s after the front one: its epochs wait for their pairs, none is lost; no message more."""
     said = assert_live_is_run({"front": log_of(epochs["front"]), "rear": log_of(epochs["rear"][150:])}, tmp_path)

@@ -15,6 +15,7 @@ import numpy as np
 from railfix.core.errors import OutputError
 from railfix.core.timescale import GPS_EPOCH
 from railfix.core.utc import gps_now_ns
+from railfix.gnss.observations import Observations
 from railfix.live.console import Metrics
 from railfix.live.engine import END_NS, LiveEngine, LiveOutput
 from railfix.live.forms import gga_sentence
@@ -40,7 +41,9 @@ _STATUS_S: Final = 0.5  #: Least time between two updates of the status line [s]
 BASE: Final = "base"  #: Key of the base station's source among the sources.
 
 _LOG: Final = logging.getLogger("railfix.live")
-_Queue = asyncio.Queue[tuple[str, ReceivedData | None] | Sensed]
+#: Items of a source with the source's name: received data; in a replay, the time tag of the file's next epoch [ns],
+#: before the file waits for its turn; None at the end.
+_Queue = asyncio.Queue[tuple[str, ReceivedData | int | None] | Sensed]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -136,8 +139,9 @@ class _Session:
     """Running session: engine, sinks, states of the streams, and the monotonic times at which the state was last saved
     and the status last shown [s].
 
-    `read_to_ns` contains the latest time tag [ns] of each source that has not ended, -1 before the first tag of the
-    source. `place` is the last position as a GGA sentence, which is sent to the caster of a virtual base station.
+    `read_to_ns` contains, for each source that has not ended, the time [ns] up to which its epochs have been passed to
+    the engine, -1 before the first epoch. `place` is the last position as a GGA sentence, which is sent to the caster
+    of a virtual base station.
     """
 
     engine: LiveEngine
@@ -181,6 +185,8 @@ class _Session:
                     name, received = item
                     if received is None:
                         read_to_ns.pop(name)
+                    elif isinstance(received, int):
+                        read_to_ns[name] = max(read_to_ns[name], received - 1)
                     else:
                         tag_ns = self.take(name, received, None if replay else now)
                         read_to_ns[name] = max(read_to_ns[name], tag_ns)
@@ -211,6 +217,9 @@ class _Session:
         """
         async for received in self.received(name, source):
             if turn is not None and received.epochs:
+                if isinstance(turn, _InTurn):
+                    # epochs of the other files before this one must not wait until it has been processed
+                    await queue.put((name, _gps_ns(received.epochs[0])))
                 await turn.wait(name, received.epochs[-1].time[-1])
             await queue.put((name, received))
         if turn is not None:
@@ -267,7 +276,7 @@ class _Session:
                 self.engine.add_sbas(messages)
         tag_ns = -1
         for epoch in received.epochs:
-            tag_ns = int((epoch.time[0] - GPS_EPOCH).astype(np.int64))
+            tag_ns = _gps_ns(epoch)
             if name == BASE:
                 self.engine.add_base(epoch)
                 continue
@@ -389,6 +398,11 @@ class _InTurn:
     def ended(self, name: str) -> None:
         """Record that a file has no more epochs."""
         self._waiting.pop(name, None)
+
+
+def _gps_ns(epoch: Observations) -> int:
+    """Return the time tag of an epoch since the beginning of GPS time [ns]."""
+    return int((epoch.time[0] - GPS_EPOCH).astype(np.int64))
 
 
 def status_text(output: LiveOutput, metrics: Metrics) -> str:
