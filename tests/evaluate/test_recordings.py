@@ -15,6 +15,7 @@ import pytest
 
 import level_cases
 import recordings_score
+from railfix.core.reasons import Reason
 from railfix.evaluate import Score, along_track_error, interpolate_reference
 from railfix.io import read_observations
 from railfix.io.positions import read_positions
@@ -225,7 +226,8 @@ def test_short_faults_on_a_curved_course_are_excluded(recordings: Path, size_m: 
         code = observations.code_m.copy()
         code[here, channel] += size_m
         result = processor.process({"front": replace(observations, code_m=code)})[0].antennas["front"]
-        excluded = result.raim.excluded[here]
+        gross = result.reason[np.ix_(here, clean.columns)] & int(Reason.GROSS_ERROR) > 0  # found before RAIM
+        excluded = result.raim.excluded[here] | gross
         right += int((excluded[:, k] & (excluded.sum(axis=1) == 1)).sum())
         wrong += int((excluded.any(axis=1) & ~excluded[:, k]).sum())
         tried += len(here)

@@ -155,7 +155,7 @@ CAUSES = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.every(4)
 @pytest.mark.parametrize("fault", FAULTS)
 def test_cause_and_time_to_alert_of_faults(fault: str) -> None:
     """200 seeds; the fault begins at 20 s; the alert comes within 6 s of an error beyond the radius."""

@@ -28,7 +28,7 @@ from railfix.live.sinks import open_sink
 from railfix.live.state import SavedSession
 from railfix.live.state_values import encode
 from railfix.live.stream import ReceivedData, ReceiverState, single_epochs
-from railfix.ranges.sbas import SbasMessages, read_sbas
+from railfix.ranges.sbas import SbasMessages, SbasState, read_sbas
 from railfix.simulate import LineSettings, RunSettings, Scenario, write_run
 
 HOUR = np.timedelta64(3600, "s")
@@ -63,7 +63,7 @@ def soak(folder: Path, *, hours: float, rate_hz: float, sbas: bool = False, chan
         config,
         {name: railfix.antenna_trajectory(track, vehicle, name) for name in ("front", "rear")},
         navigation=sent_by(navigation, np.datetime64("1980-01-06", "ns"), start),
-        messages=None,
+        corrections=SbasState(prn=137) if sbas else None,
     )
     settings = LiveSettings(period_s=min(1.0 / rate_hz, 60.0), no_input="skip")
     engine = (TwoChannels if channels == 2 else LiveEngine)(processor, settings)

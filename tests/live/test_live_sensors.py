@@ -261,7 +261,7 @@ def test_a_radar_whose_mounting_moves_is_told_in_a_running_session(case: Ride, t
             assert len(vars(watch)["_radar"].radar) < 130 * 10
         for output in outputs:
             front, track = output.result.antennas["front"], output.result.fusion["front"]
-            later = replace(front, time=front.time + shift)
+            later = replace(front, corrected=replace(front.corrected, time=front.time + shift))
             result = replace(output.result, antennas={"front": later}, fusion={"front": track})
             watch.take(replace(output, result=result))
     (note,) = said

@@ -245,6 +245,8 @@ class MonitorState:
     complete_s: float = 0.0  #: Time of the last complete set of three fixes [s].
     #: Start time of the present series of healthy fixes [s]; None if the newest fixes are not healthy.
     healthy_since_s: float | None = None
+    #: Verdict on the newest incomplete set of fixes; None if the newest set is complete or no set has been judged.
+    absent: TriangleVerdict | None = None
 
 
 def advance(
@@ -272,12 +274,12 @@ def advance(
         raise ValueError(f"the clock of the monitor ran back from {state.complete_s} s to {now_s} s")
     absent = verdict in (None, TriangleVerdict.MONITOR_LOST, TriangleVerdict.JAMMING)
     if absent:
-        state = replace(state, healthy_since_s=None)
+        state = replace(state, healthy_since_s=None, absent=verdict or state.absent)
         if now_s - state.complete_s <= limits.late_s:
             return state, ()
-        return _stop(state, now_s, verdict or TriangleVerdict.MONITOR_LOST, -1)
+        return _stop(state, now_s, state.absent or TriangleVerdict.MONITOR_LOST, -1)
     assert verdict is not None
-    state = replace(state, complete_s=now_s)
+    state = replace(state, complete_s=now_s, absent=None)
     if verdict in STOPPING:
         return _stop(replace(state, healthy_since_s=None), now_s, verdict, receiver)
     if verdict is not TriangleVerdict.HEALTHY:
