@@ -42,11 +42,11 @@ CASES: dict[str, tuple[str, int | None, str]] = {
     "ionosphere in words": (header(lines=[label("GPSA   0.11oops", "IONOSPHERIC CORR")]) + GOOD, 2, "IONOSPHERIC CORR"),
     "only SBAS": (header() + "".join(record("S22").splitlines(keepends=True)[:4]), None, "no usable"),
     "cut in the middle of a record": (
-        header() + "".join(LINES[:5]) + GOOD, 3, "G01 has 5 lines, 8 were expected.*; --lenient"),
-    "cut in its only record": (header() + "".join(LINES[:5]), None, "no usable .* G01 has 5 lines, 8 were expected"),
-    "a line of a record lost": (header() + "".join(LINES[:3] + LINES[4:]) + GOOD, 3, "G01 has 7 lines, 8 were"),
+        header() + "".join(LINES[:5]) + GOOD, 3, "G01 has 5 lines, but 8 were expected.*; --lenient"),
+    "cut in its only record": (header() + "".join(LINES[:5]), None, "no usable .* G01 has 5 lines, but 8 were"),
+    "a line of a record lost": (header() + "".join(LINES[:3] + LINES[4:]) + GOOD, 3, "G01 has 7 lines, but 8 were"),
     "name of the next record lost": (
-        header() + GOOD + GOOD.replace("G01", "   ") + GOOD, 3, "G01 has 16 lines, 8 were"),
+        header() + GOOD + GOOD.replace("G01", "   ") + GOOD, 3, "G01 has 16 lines, but 8 were"),
     "record before any name": (header() + "".join(LINES[1:]) + GOOD, 3, "before the first record"),
     "unknown constellation": (header() + GOOD.replace("G01", "X01"), 3, "'X01' is not a satellite name"),
     "satellite zero": (header() + GOOD.replace("G01", "G00"), 3, "'G00' is not a satellite name"),
@@ -69,7 +69,7 @@ CASES: dict[str, tuple[str, int | None, str]] = {
     "angle of many turns": (_damaged(1, "1.234500000000D+00", "1.234500000000D+02"), 12, "G01: m0 is 123.45"),
     "columns shifted": (_damaged(4, "    ", "     "), 15, "G01: "),
     "GLONASS without velocity": (header() + record("R05", {"y_velocity": None}), 5, "R05: y_velocity is blank"),
-    "GLONASS with six lines": (header() + record("R05", {"extra": [1.0] * 8}) + GOOD, 3, "R05 has 6 lines, 4 were"),
+    "GLONASS with six lines": (header() + record("R05", {"extra": [1.0] * 8}) + GOOD, 3, "R05 has 6 lines, but 4 were"),
     "version 2 cut": (header(2.1) + record_2(" 1", time="20  6 26  8  0  0.0")[:-80], None, "G01 has 7 lines"),
     "version 2 without a number": (header(2.1) + record_2(" x", time="20  6 26  8  0  0.0"), 3, "'G x' is no"),
     "version 4 title": (header(4.0) + "> EPH\n" + GOOD, 3, "'> EPH' is no"),
@@ -94,7 +94,7 @@ def test_error_names_file_line_and_cause(tmp_path: Path, case: str) -> None:
 @pytest.mark.requirement("G5")
 def test_a_cut_last_record_is_left_out_with_a_note(tmp_path: Path) -> None:
     found = read_navigation(write(tmp_path, header() + GOOD + "".join(LINES[:5])))
-    assert found.skipped == {"cut at the end of the file": 1}
+    assert found.skipped == {"records cut short by the end of the file": 1}
     assert len(found.kepler) == len(found.notes) == 1
 
 

@@ -210,7 +210,7 @@ def test_a_restarted_receiver_and_repeated_messages(recordings: Path) -> None:
     whole, _ = in_fragments(data, [])
     twice, _ = in_fragments(data + data, [])
     assert np.array_equal(whole.time, twice.time)
-    assert twice.skipped["epochs not after the previous one"] == len(whole)
+    assert twice.skipped["epochs that are not later than the previous epoch"] == len(whole)
 
 
 def pieces_of(path: Path, epochs: int) -> Iterator[Observations]:
@@ -372,7 +372,7 @@ def test_observations_of_old_kinds_are_named(tmp_path: Path) -> None:
         log += rtcm
         log += int(crc24q(np.frombuffer(rtcm, np.uint8), np.array([0]), np.array([len(rtcm)]))[0]).to_bytes(3, "big")
     (tmp_path / "old.log").write_bytes(log)
-    has = r"its RTCM 1004 \(2\), RTCM 1083 \(1\), UBX RXM-RAW \(1\) are of unsupported kinds"
+    has = r"its messages RTCM 1004 \(2\), RTCM 1083 \(1\), UBX RXM-RAW \(1\) are not supported"
     with pytest.raises(InputFileError, match=has):
         railfix.read_observations(tmp_path / "old.log")
 

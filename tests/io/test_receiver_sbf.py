@@ -331,7 +331,7 @@ def test_further_antennas_and_scrambled_blocks_are_left_out(logged: Observations
     read = railfix.read_observations(path)
     assert len(read) == 2
     assert read.skipped["scrambled MeasEpoch"] == 1
-    assert read.skipped["measurements of further antennas of a MeasEpoch"] == 1
+    assert read.skipped["MeasEpoch measurements of auxiliary antennas"] == 1
 
 
 def test_blocks_without_measurements_name_no_receiver(logged: Observations) -> None:

@@ -113,7 +113,7 @@ def test_fields_of_a_ubx_measurement(changes: dict[str, float], expected: dict[s
     read = ubx.rawx_measurements(frames_of(rawx(raw(), raw(**changes))))
     check(read, UBX_PLAIN, expected)
     lost = int(any(abs(value) >= 1e10 for name, value in changes.items() if name in ("code", "phase")))
-    assert read.skipped == ({"RXM-RAWX measurements with impossible numbers": 1} if lost else {})
+    assert read.skipped == ({"RXM-RAWX measurements with impossible values": 1} if lost else {})
     assert read.time.tolist() == [(np.datetime64("2019-11-24T00:16:40.25", "ns")).item()]
 
 

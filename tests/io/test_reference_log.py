@@ -123,7 +123,7 @@ ROW = "2024-03-05T01:00:0{},front,-3957000,3310000,3737000,0.02,rtk"
     ("rows", "said"),
     [
         ([ROW.format(0), ROW.format(1).replace("rtk", "guess")], "line 3: source is 'guess'"),
-        ([ROW.format(0), ROW.format(0)], "fewer than two positions for the antenna front with a time"),
+        ([ROW.format(0), ROW.format(0)], "the antenna front has fewer than two positions with a time"),
         ([ROW.format(0), ROW.format(1).replace("0.02", "small")], "line 3: column sigma_m: 'small' is not a number"),
         ([ROW.format(0), ROW.format("x")], "line 3: time_gpst '2024-03-05T01:00:0x' is not an ISO 8601 time"),
         ([ROW.format(0).replace("front", "rear"), ROW.format(1)], "fewer than two positions"),

@@ -84,8 +84,8 @@ LAST = gga("010005.00")
 @pytest.mark.parametrize(
     ("line", "note"),
     [
-        ("!AIVDM,1,1,,A,13u?etPv2;0n:dDPwUM1U1Cb069D,0*24", "1 lines skipped that are not NMEA"),
-        ("garbage", "1 lines skipped that are not NMEA"),
+        ("!AIVDM,1,1,,A,13u?etPv2;0n:dDPwUM1U1Cb069D,0*24", "1 skipped lines that are not NMEA"),
+        ("garbage", "1 skipped lines that are not NMEA"),
         ("NMEA," + gga("010001.00") + ",1709600401000", ""),
         (gga("010001.00").partition("*")[0], "1 sentences without checksum"),
         (gga("010001.00", geoid=""), "1 of 3 fixes have no height or no geoid separation"),

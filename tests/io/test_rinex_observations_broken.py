@@ -77,14 +77,14 @@ BROKEN: dict[str, tuple[Lines, str, int, int, int]] = {
     "satellite zero": (edit(good_3, 10, "G05", "G00"), "no satellite name can be read", 10, 6, 5),
     "satellite twice": (edit(good_3, 11, "G12", "G05"), "satellite G05 occurs twice", 11, 6, 6),
     "types not declared": (edit(good_3, 10, "G05", "E05"), "E05: the header has no observation types", 10, 6, 5),
-    "line missing": (without(good_3, 10), "declares 2 lines, 1 follow", 9, 5, 5),
-    "line too many": (inserted(good_3, 10, "G07      20000000.000"), "declares 2 lines, 3 follow", 9, 5, 5),
+    "line missing": (without(good_3, 10), "declares 2 lines, but 1 follow", 9, 5, 5),
+    "line too many": (inserted(good_3, 10, "G07      20000000.000"), "declares 2 lines, but 3 follow", 9, 5, 5),
     "line before the first epoch": (inserted(good_3, 6, "G07"), "an epoch line was expected, found 'G07'", 6, 6, 6),
-    "month 13": (edit(good_3, 9, "2021 05", "2021 13"), "the month is none of 1 to 12", 9, 5, 5),
+    "month 13": (edit(good_3, 9, "2021 05", "2021 13"), "the month is not in 1 to 12", 9, 5, 5),
     "30 February": (edit(good_3, 9, "05 17", "02 30"), "the day does not exist in its month", 9, 5, 5),
     "hour 24": (edit(good_3, 9, "02 33", "24 33"), "the hour is not in 0 to 23", 9, 5, 5),
     "minute 60": (edit(good_3, 9, "02 33", "02 60"), "the minute is not in 0 to 59", 9, 5, 5),
-    "second 60": (edit(good_3, 9, "14.0000000", "60.0000000"), "the seconds are not from 0 to below 60", 9, 5, 5),
+    "second 60": (edit(good_3, 9, "14.0000000", "60.0000000"), "the seconds are not at least 0 and below 60", 9, 5, 5),
     "letter in the seconds": (edit(good_3, 9, "14.0000000", "14.00o0000"), "the seconds are not", 9, 5, 5),
     "letter in the year": (edit(good_3, 9, "2021", "2O21"), "the year is not a number", 9, 5, 5),
     "time one column off": (edit(good_3, 9, "14.0000000  0", " 14.0000000 0"), "not in their columns", 9, 5, 5),
@@ -92,7 +92,7 @@ BROKEN: dict[str, tuple[Lines, str, int, int, int]] = {
     "count no number": (edit(good_3, 9, "0  2", "0  x"), "satellites '  x' is not a number", 9, 5, 5),
     "count of two parts": (edit(good_3, 9, "0  2", "02 2"), "satellites '2 2' is not a number", 9, 5, 5),
     "epoch line short": (edit(good_3, 9, "  0  2", ""), "shorter than 35 characters", 9, 5, 5),
-    "time runs ahead": (edit(good_3, 12, "2021", "2051"), "is more than 20 epochs or one hour out of order", 12, 5, 5),
+    "time runs ahead": (edit(good_3, 12, "2021", "2051"), "out of order by more than 20 epochs or one hour", 12, 5, 5),
     "INTERVAL no number": (inserted(good_3, 4, record("     o.1", "INTERVAL")), "'o.1' cannot be read", 4, 6, 6),
     "position no number": (
         inserted(good_3, 4, record("  1.0  2.0  x.0 *", "APPROX POSITION XYZ")),
@@ -102,9 +102,9 @@ BROKEN: dict[str, tuple[Lines, str, int, int, int]] = {
         6,
     ),
     "RINEX 2: letter in a phase": (edit(good_2, 10, "100000001.000", "1O0000001.000"), "L1 of G05", 10, 6, 5),
-    "RINEX 2: line missing": (without(good_2, 10), "needs 2 lines, 1 follow", 9, 5, 5),
+    "RINEX 2: line missing": (without(good_2, 10), "needs 2 lines, but 1 follow", 9, 5, 5),
     "RINEX 2: line too many": (inserted(good_2, 12, " " * 20 + "1.000"), "an epoch line was expected", 12, 6, 6),
-    "RINEX 2: month 13": (edit(good_2, 9, "05  4", "05 13"), "the month is none of 1 to 12", 9, 5, 5),
+    "RINEX 2: month 13": (edit(good_2, 9, "05  4", "05 13"), "the month is not in 1 to 12", 9, 5, 5),
     "RINEX 2: epoch line broken": (edit(good_2, 9, " 0  0  1.0", " 0  0  1,0"), "an epoch line was expected", 9, 5, 5),
     "RINEX 2: no name": (edit(good_2, 9, "G05", "G?5"), "no satellite name can be read", 10, 6, 5),
     "RINEX 2: names missing": (edit(good_2, 9, "G05G12", "G05"), "no satellite name can be read", 11, 6, 6),
@@ -184,7 +184,7 @@ def test_header_records_among_the_epochs(tmp_path: Path, version: int, what: str
         found = read_observations(write(tmp_path / "log.obs", text.splitlines()))
         np.testing.assert_array_equal(found.code_m[:3], good.code_m[:3])
         assert not np.array_equal(found.code_m[3:], good.code_m[3:])
-        assert any(f"line {middle + 1}: a further header begins here" in problem for problem in found.problems)
+        assert any(f"line {middle + 1}: another header begins here" in problem for problem in found.problems)
         return
     found = read_observations(path)
     np.testing.assert_array_equal(found.code_m, good.code_m)
@@ -247,7 +247,7 @@ WRONG_FILE: dict[str, tuple[bytes, str]] = {
     "only the first line": (text_of(good_3()[:1]), "has no END OF HEADER"),
     "no types": (text_of(header_3({})), "has no SYS / # / OBS TYPES"),
     "no types, RINEX 2": (text_of(without(good_2, 3)), "has no # / TYPES OF OBSERV"),
-    "types miscounted": (text_of(edit(good_3, 3, "G    4", "G    5")), "5 observation types of G are declared, 4"),
+    "types miscounted": (text_of(edit(good_3, 3, "G    4", "G    5")), "5 observation types of G are declared, but 4"),
     "types uncounted": (text_of(edit(good_3, 3, "G    4", "G    x")), "number of types 'x' is not a whole number"),
     "type unknown": (text_of(edit(good_3, 3, "L1C", "Y1C")), "'Y1C' is not an observation type"),
     "types of nothing": (text_of(edit(good_3, 3, "G    4", "      ")), "the constellation letter is missing"),
@@ -255,7 +255,7 @@ WRONG_FILE: dict[str, tuple[bytes, str]] = {
     "scale factor": (text_of(inserted(good_3, 4, record("G   7", "SYS / SCALE FACTOR"))), "'7' is none of 1, 10"),
     "scale factor's types": (
         text_of(inserted(good_3, 4, record("G   10   3 C1C", "SYS / SCALE FACTOR"))),
-        "3 observation types were expected, 1 are listed",
+        "3 observation types were expected, but 1 are listed",
     ),
     "strength unit": (text_of(inserted(good_3, 4, record("SNR", "SIGNAL STRENGTH UNIT"))), "DBHZ was expected"),
     "header only": (text_of(header_3()), "has a header but no epochs"),
@@ -324,7 +324,7 @@ def test_data_before_damage_are_read(tmp_path: Path, pack: str) -> None:
         read_observations(path)
     counted = read_observations(path, broken_lines="count")
     assert len(counted) > 1000 or pack == "gzip"
-    assert "the data before it were read" in counted.problems[0]
+    assert "the data before this place were read" in counted.problems[0]
 
 
 def test_compress_cut_short_ends_in_the_middle(tmp_path: Path) -> None:
@@ -345,7 +345,7 @@ def test_nothing_in_the_span_asked_for(tmp_path: Path) -> None:
 def test_options_are_checked(tmp_path: Path, options: dict[str, str]) -> None:
     with pytest.raises(ValueError, match=r"was expected|were expected"):
         read_observations(write(tmp_path / "log", good_3()), **options)
-    with pytest.raises(ValueError, match="at least one epoch"):
+    with pytest.raises(ValueError, match="at least 1 was expected"):
         scan_observations(tmp_path / "log", epochs=0)
     with pytest.raises(SettingsError, match="no file"):
         read_observations([])

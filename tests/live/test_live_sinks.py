@@ -334,7 +334,7 @@ def test_a_reference_out_of_reach_is_an_error(tmp_path: Path) -> None:
     words = ["live", "--front", str(demo_files()["front"]), "--track", str(demo_files()["track"])]
     done = RUNNER.invoke(app, [*words, "--send", "etcs@-", "--live", "reference_m=400000"])
     assert done.exit_code == 4
-    assert "move it nearer" in " ".join(done.output.split())
+    assert "choose one nearer" in " ".join(done.output.split())
     with pytest.raises(SettingsError, match="FORM@TARGET"):
         asyncio.run(open_sink(f"packet0@{tmp_path}/x"))
 
@@ -381,7 +381,7 @@ def test_an_output_on_a_full_disk_ends_alone(tmp_path: Path) -> None:
     assert done.exit_code == 8, done.output
     assert len(good.read_text().splitlines()) == 150
     said = " ".join(done.output.split())
-    assert "/dev/full: cannot be written (No space left on device); this output has ended, the others continue" in said
+    assert "/dev/full: cannot be written (No space left on device); this output has ended, but the others" in said
     alone = RUNNER.invoke(app, [*words, "--send", "json@/dev/full"])
     assert alone.exit_code == 8
 

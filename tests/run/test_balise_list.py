@@ -56,7 +56,7 @@ def test_balises_lie_on_the_line_or_on_a_track_of_it(track: Track, tmp_path: Pat
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("balise\nA\n", "has no column chainage_m; expected balise, chainage_m of the list of balises"),
+        ("balise\nA\n", "has no column chainage_m; a table of the list of balises needs balise, chainage_m"),
         (HEADER + "A,1\nA,2\n", "lists balise A twice; give each once"),
         (HEADER + "A,-5\n", r"lists no balise on the line \(0 to 1109 m\)"),
         (HEADER + ",5\n", "row 2: balise is empty"),

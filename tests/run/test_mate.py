@@ -69,7 +69,7 @@ def test_an_unknown_column_is_refused_with_one_sentence(folder: Path, tmp_path: 
     with pytest.raises(InputFileError, match="has a column SNR that is not in S_GNSS_SAT of EGNSS MATE; remove"):
         read_observations(path)
     pl.read_parquet(folder / "S_GNSS_SAT.parquet").drop("PSEUDORANGE").write_parquet(path)
-    with pytest.raises(InputFileError, match="has no column PSEUDORANGE; expected GPS_WEEK"):
+    with pytest.raises(InputFileError, match="no column PSEUDORANGE; the EGNSS MATE table S_GNSS_SAT needs GPS_WEEK"):
         read_observations(path)
 
 

@@ -140,7 +140,7 @@ class EpochOrder:
 
     def _reject(self, rows: Indices, time: Datetimes, path: np.ndarray, line: Integers) -> None:
         for row in rows.tolist():
-            what = f"the time tag {str(time[row])[:23]} is more than {MOST_PASSED} epochs or one hour out of order"
+            what = f"the time tag {str(time[row])[:23]} is out of order by more than {MOST_PASSED} epochs or one hour"
             if self._broken_lines == "stop":
                 raise InputFileError(str(path[row]), f"{what}; {LENIENT}", line=int(line[row]) or None)
             self._found.append(f"{_where(str(path[row]), int(line[row]))}: {what}; the epoch was skipped")

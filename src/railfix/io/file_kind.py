@@ -25,11 +25,11 @@ MAPS: Final[tuple[FileKind, ...]] = ("table", "mate", "geojson", "kml", "gpx", "
 #: Description of each kind of file for messages; in brackets, the command-line option for such a file.
 KIND_WORDS: Final[dict[FileKind, str]] = {
     "observations": "a RINEX observation file (--front, --rear)", "navigation": "a RINEX navigation file (--nav)",
-    "rinex": "a RINEX file of clocks or meteorology", "sp3": "an SP3 file of precise orbits (--sp3)",
+    "rinex": "a RINEX clock or meteorological file", "sp3": "an SP3 file of precise orbits (--sp3)",
     "sbas": "a log of SBAS messages (--sbas)", "receiver": "a receiver's log", "nmea": "an NMEA log",
     "novatel": "a NovAtel log", "rtklib": "an RTKLIB solution (.pos)", "gpx": "a GPX file", "table": "a table",
     "parquet": "a Parquet table",
-    "android": "a log of Android's GnssLogger, which also writes a RINEX file", "mate": "an EGNSS MATE table",
+    "android": "a log of Android's GnssLogger, which can write RINEX files instead", "mate": "an EGNSS MATE table",
     "geojson": "a JSON file", "kml": "a KML file", "osm": "an OpenStreetMap file", "xml": "an XML file",
     "rdf": "an RDF file", "ifc": "an IFC file", "dxf": "a DXF file", "gml": "a GML file", "gpkg": "a GeoPackage",
     "shp": "a Shapefile", "fgb": "a FlatGeobuf file", "pbf": "an OpenStreetMap file (.pbf)", "toml": "a TOML file",

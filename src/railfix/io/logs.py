@@ -152,7 +152,7 @@ def scan_observations(
     if not all(receiver):
         raise MismatchError(
             f"{paths[receiver.index(False)]} is a RINEX file and {paths[receiver.index(True)]} a receiver log; "
-            "give files of one kind for one antenna"
+            "all files of an antenna must be of one kind"
         )
     return in_pieces(_receiver_runs(paths, letters, (start, end, date), progress), epochs)
 
@@ -165,7 +165,7 @@ def _mate_pieces(
 ) -> Iterator[Observations]:
     """Return the observations of EGNSS MATE tables S_GNSS_SAT in order of time, in pieces."""
     if others := [path for path in paths if mate_table(path) != "S_GNSS_SAT"]:
-        raise MismatchError(f"{others[0]} is not a table S_GNSS_SAT; give files of one kind for one antenna")
+        raise MismatchError(f"{others[0]} is not a table S_GNSS_SAT; all files of an antenna must be of one kind")
     tables = sorted((read_mate_observations(path) for path in paths), key=lambda part: part.time[0])
     pieces = list(in_pieces((_of_systems(part[slice(*limits)], systems) for part in tables), epochs))
     if not any(len(piece) for piece in pieces):

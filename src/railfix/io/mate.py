@@ -86,7 +86,7 @@ def read_mate(path: FilePath, needed: tuple[str, ...], table_name: str = "") -> 
     unknown column or no rows, or lacks a `needed` column.
     """
     name, file = table_name or mate_table(path), Path(path)
-    with reading_table(path, f"cannot be read as the table {name} of EGNSS MATE ({{}})"):
+    with reading_table(path, f"cannot be read as the EGNSS MATE table {name} ({{}})"):
         if file.suffix.lower() == ".parquet":
             table = pl.read_parquet(file)
         else:
@@ -100,7 +100,7 @@ def read_mate(path: FilePath, needed: tuple[str, ...], table_name: str = "") -> 
         )
     missing = [column for column in needed if column not in table.columns]
     if missing:
-        raise InputFileError(path, f"has no column {missing[0]}; expected {', '.join(needed)} of {name} of EGNSS MATE")
+        raise InputFileError(path, f"has no column {missing[0]}; the EGNSS MATE table {name} needs {', '.join(needed)}")
     if not len(table):
         raise InputFileError(path, "has no rows; leave the table out")
     absent = [column for column in READ[name] if column not in table.columns]
@@ -156,13 +156,13 @@ def read_mate_observations(path: str) -> Observations:
     usable = ~(table["ERROR"].cast(pl.Boolean).fill_null(False)) & table["TRACKING_STATUS"].cast(pl.Boolean).fill_null(
         True
     )
-    skipped["rows with an error or not tracked"] = len(table) - int(usable.sum())
+    skipped["rows with an error, or of signals that are not tracked"] = len(table) - int(usable.sum())
     pairs = table.select("SAT_ID", "SIGNAL_TYPE").unique()
     codes = pairs.with_columns(code=pl.Series([signal_code(*pair) for pair in pairs.iter_rows()], dtype=pl.String))
     table = table.filter(usable).join(codes, on=["SAT_ID", "SIGNAL_TYPE"], how="left", nulls_equal=True)
     known = table["code"].fill_null("") != ""
     for name, count in table.filter(~known).group_by("SIGNAL_TYPE").len().iter_rows():
-        skipped[f"rows of the signal type {name}"] += count
+        skipped[f"rows of the unknown signal type {name}"] += count
     table = table.filter(known)
     if not len(table):
         raise InputFileError(path, "has no row of a known satellite and signal, such as G05 and L1CA")

@@ -167,7 +167,7 @@ def parse_named_columns(lines: Iterable[str], path: FilePath) -> NamedColumns:
             row = next(csv.reader([line], delimiter=separator)) if '"' in line else line.split(separator)
             cells = [cell.strip() for cell in row]
         except csv.Error as error:
-            raise InputFileError(path, f"is not a row of cells ({error})", line=number) from None
+            raise InputFileError(path, f"cannot be split into cells ({error})", line=number) from None
         if not header:
             header, header_line = cells, number
             continue

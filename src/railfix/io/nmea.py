@@ -22,7 +22,7 @@ from railfix.io.position_log import PositionLog
 
 #: Names of the counts of lines that are unusual but no errors.
 _OTHER_LINES, _UNCHECKED = (
-    "lines skipped that are not NMEA 0183 sentences",
+    "skipped lines that are not NMEA 0183 sentences",
     "sentences without checksum",
 )
 #: A geoid separation of 0 is reported as doubtful if the geoid is at least this far from the ellipsoid [m].
@@ -137,7 +137,7 @@ def _doubt_separation(path: FilePath, fixes: list[_Gga], geodetic: Floats) -> li
         there = f"{height:.0f} m (EGM96)"
     return [
         f"{path}: the geoid separation is 0 in every fix, but the geoid is {there} from the ellipsoid; the heights are "
-        "taken as ellipsoidal, and are wrong by this distance if the receiver wrote heights above sea level"
+        "used as ellipsoidal heights, and are wrong by this distance if the receiver wrote heights above sea level"
     ]
 
 

@@ -122,11 +122,11 @@ def positions_of_table(table: NamedColumns) -> PositionLog:
     geodetic = all(name in table for name in _GEODETIC[:2])
     for name in _GEODETIC if geodetic else (*_GEODETIC, *_CARTESIAN):
         if name in absent and not cartesian:
-            raise table.header_error(f"column {absent[name]!r} is unknown; is {name!r} meant?")
+            raise table.header_error(f"column {absent[name]!r} is unknown; did you mean {name!r}?")
     if not geodetic and not cartesian:
         raise table.header_error(
             "no columns latitude_deg, longitude_deg, height_m (ellipsoidal) or x_m, y_m, z_m (ECEF); the columns are "
-            f"{', '.join(table.cells)} (for other column names, give columns, --column latitude_deg=NAME)"
+            f"{', '.join(table.cells)} (to read columns with other names, give columns, or --column latitude_deg=NAME)"
         )
     if not len(table):
         raise InputFileError(path, "there is no position below the header")

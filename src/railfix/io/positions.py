@@ -40,10 +40,12 @@ def _read_gpx(path: FilePath) -> PositionLog:
         stamps = [stamp.removesuffix("Z") or "NaT" for line in lines for stamp in line.time]
         utc = np.array(stamps, dtype="datetime64[ns]")
     except ValueError:
-        raise InputFileError(path, "a time is not UTC such as 2024-01-01T10:00:00Z") from None
+        raise InputFileError(path, "a time is not in the form 2024-01-01T10:00:00Z (UTC)") from None
     known = np.isfinite(points[:, 2])
     notes = (
-        [f"{path}: GPX heights are above the geoid, and are not corrected"] if (known & np.isnan(geoid)).any() else []
+        [f"{path}: GPX heights above the geoid are used as ellipsoidal heights"]
+        if (known & np.isnan(geoid)).any()
+        else []
     )
     if not known.all():
         notes.append(f"{path}: {int((~known).sum()):,} of {len(points):,} points have no height (ele)")
@@ -152,7 +154,9 @@ def read_positions(
     check_path(path)
     kind = find_kind(path)
     if columns and kind != "table":
-        raise SettingsError(f"{path}: columns can only be renamed in a table with named columns; leave them out")
+        raise SettingsError(
+            f"{path}: only a table with named columns can have columns renamed; leave out columns (--column)"
+        )
     parsers: dict[FileKind, Callable[[list[str]], PositionLog]] = {
         "table": lambda lines: parse_csv_positions(lines, path, columns or {}),
         "novatel": lambda lines: _parse_novatel(lines, path),
@@ -189,7 +193,7 @@ def _in_order(log: PositionLog) -> PositionLog:
         return log
     longest = float(np.max(np.maximum.accumulate(time) - time) / np.timedelta64(1, "s"))
     where = f"{log.path}, line {log.line[known[back[0]]]}: the time goes back"
-    times = "" if len(back) == 1 else f", and {plural(len(back) - 1, 'more time')} in the file"
+    times = "" if len(back) == 1 else f", and again at {plural(len(back) - 1, 'later row')}"
     if longest > _SORTED_S or len(known) < len(log):
         note = f"{where} by {longest:,.1f} s{times}; the rows stay in the order of the file"
         return replace(log, notes=(*log.notes, note))

@@ -112,13 +112,13 @@ def read_reference(
         raise InputFileError(
             path,
             f"the reference of several antennas must have a column antenna ({', '.join(antennas)}); give a CSV file "
-            "with this column (railfix reference writes it from a log of one antenna)",
+            "with this column, as railfix reference writes it from the log of one antenna",
         )
     values = _columns(log, cells)
     what = ""
     if log.has_quality:
         wanted, there = ", ".join(map(str, quality)), qualities_in_words(log)
-        what = f" and quality {wanted} (the log has {there}; railfix evaluate --reference-quality accepts others)"
+        what = f" and quality {wanted} (the log has {there}; see railfix evaluate --reference-quality)"
     return {name: _of_antenna(path, name, owner, usable, values, what) for name in antennas}
 
 
@@ -151,7 +151,7 @@ def _of_antenna(
     if len(first) < 2:
         others = sorted({*owner.tolist()} - {name})
         there = f"; the file has positions of {', '.join(others)}" if others else ""
-        raise InputFileError(path, f"fewer than two positions for the antenna {name} with a time{what}{there}")
+        raise InputFileError(path, f"the antenna {name} has fewer than two positions with a time{what}{there}")
     return AntennaReference(**{key: values[rows[first]] for key, values in columns.items()})  # type: ignore[arg-type]
 
 

@@ -63,9 +63,9 @@ def read_sensor_table(path: FilePath, kind: str) -> pl.DataFrame:
     needed = (*stamp, *(name for name in COLUMNS[kind] if not name.startswith("[")))
     missing = [name for name in needed if name not in table.columns]
     if missing:
-        raise InputFileError(path, f"has no column {missing[0]}; expected {', '.join(needed)} of the {kind}")
+        raise InputFileError(path, f"has no column {missing[0]}; a table of the {kind} needs {', '.join(needed)}")
     if not len(table):
-        raise InputFileError(path, f"has no rows; expected rows of the {kind}; without them, leave the file out")
+        raise InputFileError(path, f"has no rows; expected rows of the {kind}; if there are none, leave the file out")
     present = [name for name in names_of_columns(kind) if name in table.columns]
     silent = table.select(pl.all_horizontal(pl.col(present).is_null())).to_series() if kind in _SILENT else None
     table = table.with_columns(
@@ -161,7 +161,7 @@ def _read_mate_table(path: FilePath, kind: str) -> pl.DataFrame:
     name = mate_table(path)
     expected = {"inertial": "S_IMU", "radar": "S_SPEEDOMETER", "balises": "S_BALISEREADER"}
     if name != expected.get(kind, "S_DM_BALISE" if kind == "list of balises" else ""):
-        raise InputFileError(path, f"is the table {name} of EGNSS MATE, which is not a table of the {kind}")
+        raise InputFileError(path, f"is the EGNSS MATE table {name}, which has no data of the {kind}")
     if name == "S_DM_BALISE":
         table = read_mate(path, ("NID_C", "NID_BG", "N_PIG", "TRACK_EDGE_ID", "POSITION"))
         rows = _first_of_group(table).unique(("NID_C", "NID_BG"), keep="last", maintain_order=True)

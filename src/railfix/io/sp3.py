@@ -48,7 +48,9 @@ def read_sp3(paths: Paths) -> PreciseEphemeris:
     times, row = np.unique(np.array(epoch, dtype=np.int64), return_inverse=True)
     satellites, column = np.unique(np.array(satellite, dtype="<U3"), return_inverse=True)
     if len(times) < POINTS:
-        raise InputFileError(source, f"has {len(times)} epochs, the interpolation of orbits needs at least {POINTS}")
+        raise InputFileError(
+            source, f"has {len(times)} epochs, but the interpolation of orbits needs at least {POINTS}"
+        )
     grid = np.full((len(times), len(satellites), 4), np.nan)
     # Assigned in reverse order, so that the first of several values is kept.
     grid[row[::-1], column[::-1]] = np.array(numbers)[::-1]
@@ -125,7 +127,7 @@ def _time_system(path: FilePath, lines: list[str]) -> str:
         if line.startswith("%c"):
             system = line[9:12].strip().upper()
             if system not in _GPST and system not in _TO_GPST:
-                what = f"time system {system!r} is not supported; GPS, GAL, QZS, BDT, UTC and GLO are"
+                what = f"time system {system!r} is not supported; GPS, GAL, QZS, BDT, UTC or GLO was expected"
                 raise InputFileError(path, what, line=number)
             return system
     return "GPS"

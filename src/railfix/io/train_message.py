@@ -117,7 +117,7 @@ class TrainMessage(Message):
     def _place_with_bounds(self) -> Self:
         placed = self.status in (MessageStatus.POSITION, MessageStatus.COASTING)
         if placed and None in (self.chainage_cm, self.over_cm, self.under_cm):
-            raise ValueError("a message with a position has chainage_cm, over_cm and under_cm")
+            raise ValueError("a message with a position must have chainage_cm, over_cm and under_cm")
         if self.chainage_cm is None and (self.over_cm is not None or self.under_cm is not None):
             raise ValueError("over_cm and under_cm need chainage_cm")
         return self
@@ -165,7 +165,7 @@ def decode(data: bytes) -> TrainMessage:
     if not isinstance(values, dict) or not all(type(key) is int for key in values):
         raise MessageError("is not a map with integer keys")
     if len(values) != _entries(data):
-        raise MessageError("has a key twice, or is a map without a length")
+        raise MessageError("has a key twice, or is a map of indefinite length")
     version = values.get(_VERSION_KEY)
     if type(version) is not int or version != VERSION:
         raise MessageError(f"is of version {version!r}, {VERSION} was expected")

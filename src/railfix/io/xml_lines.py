@@ -83,7 +83,8 @@ def read_kml_lines(path: FilePath) -> list[XmlLine]:
             mode = _texts(part).get("altitudeMode", "")
             if mode.startswith("relativeTo"):
                 raise InputFileError(
-                    path, f"its altitudeMode is {mode}, which gives no track height; write absolute heights or none"
+                    path,
+                    f"its altitudeMode is {mode}, which gives no track height; write absolute heights or no heights",
                 )
             rows = [_numbers(path, f"a coordinate of {name!r}", cells) for cells in _kml_cells(part)]
             if not rows:
@@ -114,5 +115,5 @@ def _numbers(path: FilePath, where: str, cells: Sequence[str | None]) -> list[fl
     except ValueError:
         values = []
     if not 2 <= len(values) <= 4 or not (abs(values[0]) <= 360.0 and abs(values[1]) <= 90.0):
-        raise InputFileError(path, f"{where}: {', '.join(map(str, cells))} is not longitude, latitude and height")
+        raise InputFileError(path, f"{where}: {', '.join(map(str, cells))} are not longitude, latitude and height")
     return values

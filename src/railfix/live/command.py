@@ -245,7 +245,7 @@ def _hooks(
                 observer(output)
             except OutputError as error:  # closing the outlet raises the error again
                 observers.remove(observer)
-                log.say(f"{error}; this output has ended, the others continue")
+                log.say(f"{error}; this output has ended, but the others continue")
 
     show = log.show if log.shows_status else None
     return Hooks(observe=observe, sensed=sensed, save=save, show=show), streams
@@ -292,5 +292,5 @@ def _check_reference(line: OpenedLine, live: LiveSettings) -> None:
     if max(abs(end - live.reference_m) for end in ends) > _REACH_OF_REFERENCE_M:
         raise SettingsError(
             f"--live reference_m={live.reference_m:g}: the line extends from 0 to {ends[1]:.0f} m, but position "
-            f"reports reach only {_REACH_OF_REFERENCE_M:.0f} m from the reference location; move it nearer"
+            f"reports reach only {_REACH_OF_REFERENCE_M:.0f} m from the reference location; choose one nearer"
         )

@@ -215,7 +215,7 @@ class LiveEngine:
     def push(self, antenna: str, epoch: Observations, *, now_ns: int) -> None:
         """Add an antenna's epoch, received at `now_ns` (clock of `poll`); raise ValueError for an unknown antenna."""
         if antenna not in self._waiting:
-            raise ValueError(f"no trajectory for antenna {antenna}; there are {', '.join(self._antennas)}")
+            raise ValueError(f"antenna {antenna} has no trajectory; the antennas are {', '.join(self._antennas)}")
         waiting = _Waiting(epoch, now_ns, self._heard)
         self._heard_at_push = self._heard
         if self._saved is not None:

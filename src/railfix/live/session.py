@@ -176,7 +176,7 @@ class _Session:
                 now = time.monotonic_ns()
                 if isinstance(item, Sensed):
                     skipped, units = self.metrics.skipped, self.engine.processor.units
-                    skipped[f"lines of the {item.sensor} that are not rows"] += item.skipped
+                    skipped[f"lines of the {item.sensor} that are not valid rows"] += item.skipped
                     skipped["ranges to ground units that are not surveyed"] += item.count_unsurveyed(units)
                     self.engine.add_samples(item)
                     if self.hooks.sensed is not None:
@@ -310,7 +310,7 @@ class _Session:
             sink.send(output)
         except OutputError as error:
             self.ended[sink.name] = error
-            _LOG.warning("%s; this output has ended, the others continue", error)
+            _LOG.warning("%s; this output has ended, but the others continue", error)
             if len(self.ended) == len(self.sinks):
                 raise
 

@@ -175,7 +175,7 @@ async def _tcp(
             reader, writer = await asyncio.open_connection(parts.hostname, parts.port, ssl=tls)
     except ssl.SSLCertVerificationError as error:
         why = f"the server's certificate is not accepted ({error.verify_message})"
-        hint = "; if it is a private certificate, give it by --live ntrip_certificates=FILE"
+        hint = "; if you trust the certificate, give it by --live ntrip_certificates=FILE"
         raise InputFileError(hidden(source), why + hint) from None
     except ssl.SSLError as error:
         reason = (error.reason or str(error)).lower().replace("_", " ")
@@ -275,7 +275,9 @@ class _Answer:
             request = self._h11.Request(method="GET", target=parts.path, headers=head)
             return bytes(self._client.send(request) + self._client.send(self._h11.EndOfMessage()))
         except self._h11.LocalProtocolError as error:
-            raise SettingsError(f"source {hidden(self._source)!r}: cannot be requested ({error})") from None
+            raise SettingsError(
+                f"source {hidden(self._source)!r}: no valid request can be made from it ({error})"
+            ) from None
 
     def take(self, data: bytes) -> bytes:
         """Return the content decoded from further bytes of the answer; raise InputFileError if the content is not a

@@ -107,7 +107,7 @@ def load_state(path: Path, under: Mapping[str, Any]) -> Loaded:
     try:
         data = path.read_bytes()
     except FileNotFoundError:
-        return Loaded(session=None, outcome=f"state file {path}: not found, positioning starts without a stored state")
+        return Loaded(session=None, outcome=f"state file {path}: not found; positioning starts without a stored state")
     except OSError as error:
         return _refuse(path, f"cannot be read ({error.strerror})")
     line, _, content = data.partition(b"\n")
@@ -133,7 +133,9 @@ def load_state(path: Path, under: Mapping[str, Any]) -> Loaded:
         return _refuse(path, f"contains no state ({error})")
     if not isinstance(session, SavedSession):
         return _refuse(path, "contains no state")
-    return Loaded(session=session, outcome=f"state file {path}: belongs to this map, vehicle and settings")
+    return Loaded(
+        session=session, outcome=f"state file {path}: used, because it agrees with this map, vehicle and settings"
+    )
 
 
 def _part(path: Path) -> Path:

@@ -128,7 +128,7 @@ def _decode(tree: Any, stored: Mapping[str, Any]) -> Any:
     if name == "of":
         values = {field: _decode(one, stored) for field, one in more["fields"].items()}
         return _find(content, _is_value)(**values)
-    raise StateFormatError(f"{name} is not a kind of value")
+    raise StateFormatError(f"{name} is not a type that a state can contain")
 
 
 def _is_value(kind: Any) -> bool:

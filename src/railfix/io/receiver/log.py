@@ -394,7 +394,7 @@ def _week_of_log(path: FilePath, date: np.datetime64 | None) -> np.datetime64:
     if date is None or np.isnat(own):
         return own if date is None else date.astype("datetime64[ns]")
     if abs(own - date) > _SAME_WEEK:
-        what = f"its ephemerides are of {str(own)[:10]}, the date given (--date) is {str(date)[:10]}"
+        what = f"its ephemerides are of {str(own)[:10]}, but the date given (--date) is {str(date)[:10]}"
         raise MismatchError(f"{path}: {what}; leave the date out, or correct it")
     return own
 
@@ -432,7 +432,7 @@ def scan_receiver_log(
         )
         if old:
             has = ", ".join(f"{what} ({number})" for what, number in sorted(old.items()))
-            why += f"; its {has} are of unsupported kinds: log MSM4 to MSM7, or give a RINEX file made from them"
+            why += f"; its messages {has} are not supported: log MSM4 to MSM7, or convert the log to RINEX"
         raise InputFileError(path, why)
 
 
@@ -447,4 +447,4 @@ def read_receiver_navigation(paths: Iterable[FilePath], *, date: np.datetime64 |
         kinds = "UBX RXM-SFRBX, SBF raw navigation pages, RTCM 3 1019, 1020, 1042, 1044 to 1046"
         raise InputFileError(", ".join(names), why or f"contains no complete ephemeris ({kinds})")
     navigation = assemble_navigation(whole, sources=names)
-    return replace(navigation, notes=(f"{', '.join(names)}: left out: {why}",)) if undated else navigation
+    return replace(navigation, notes=(f"{', '.join(names)}: left out, because {why}",)) if undated else navigation

@@ -88,7 +88,7 @@ def join_observations(measurements: Measurements, tracking: Tracking | None = No
     slipped = slips(lock, polarity)[1:]
     indicator = _SLIP * slipped + _HALF_CYCLE * half
     counts = {
-        "epochs not after the previous one": int(np.count_nonzero(~rising)),
+        "epochs that are not later than the previous epoch": int(np.count_nonzero(~rising)),
         "measurements of unknown signals": int(np.count_nonzero(~known)),
     }
     skipped = dict(Counter(measurements.skipped) + Counter(counts))

@@ -50,7 +50,7 @@ _LAYOUT: Final = {
 MSM_NUMBERS: Final = tuple(tens * 10 + kind for tens in SYSTEMS for kind in _LAYOUT)
 #: Name of the count of MSM that are not decoded because their week is unknown.
 UNDATED: Final = "RTCM 3 observations without a date"
-IN_GPS_TIME: Final = "BeiDou messages in GPS time, read as such"
+IN_GPS_TIME: Final = "BeiDou messages with times in GPS time, read as GPS time"
 #: GPS time minus BeiDou time [s]; BeiDou times sent in GPS time are read this much too late.
 _BEIDOU_LATE_S: Final = 14
 _MOSCOW_S: Final = 10_800.0

@@ -156,7 +156,7 @@ def meas_epoch_measurements(frames: Frames) -> Measurements:
     epoch = np.repeat(np.arange(len(whole)), np.array([len(found) for _, found in whole], dtype=np.intp))
     rows = head[np.array([row for row, _ in whole], dtype=np.intp)]
     main = frames.data[place + (place == master)] >> 5 == 0
-    skipped["measurements of further antennas of a MeasEpoch"] = int(np.count_nonzero(~main))
+    skipped["MeasEpoch measurements of auxiliary antennas"] = int(np.count_nonzero(~main))
     values = {name: array[main] for name, array in _decode(frames, place, master).items()}
     return Measurements(
         time=from_week(rows["week"].astype(np.int64), rows["tow_ms"] * 1e-3),

@@ -110,7 +110,7 @@ def rawx_measurements(frames: Frames) -> Measurements:
         np.where(np.abs(rows[name]) < _LARGEST, rows[name], np.nan) for name in ("code", "phase", "doppler")
     )
     lost = (np.isnan(code) & code_valid) | (np.isnan(phase) & phase_valid)
-    skipped["RXM-RAWX measurements with impossible numbers"] = int(np.count_nonzero(lost))
+    skipped["RXM-RAWX measurements with impossible values"] = int(np.count_nonzero(lost))
     leap = header["leap"][header["status"] & 1 == 1]
     return Measurements(
         time=from_week(header["week"].astype(np.int64), header["tow"]),

@@ -107,7 +107,9 @@ def read_version(path: FilePath, line: str) -> float:
     except ValueError as error:
         raise InputFileError(path, f"RINEX version '{line[:9].strip()}' is not a number", line=1) from error
     if not 2.0 <= version < 5.0:
-        message = f"RINEX version {version:.2f} is not supported; 2.10 to 2.12, 3.00 to 3.05 and 4.00 to 4.02 are"
+        message = (
+            f"RINEX version {version:.2f} is not supported; 2.10 to 2.12, 3.00 to 3.05 or 4.00 to 4.02 was expected"
+        )
         raise InputFileError(path, message, line=1)
     return version
 
@@ -183,7 +185,7 @@ class _HeaderRecords:
             listed = len(self._types[system])
             if listed != count:
                 of = f"of {system} " if system else ""
-                message = f"{count} observation types {of}are declared, {listed} are listed"
+                message = f"{count} observation types {of}are declared, but {listed} are listed"
                 raise InputFileError(self._path, message, line=line)
         changes = dict(self._changes)
         time_system = str(changes.pop("time_system", self._header.time_system))
@@ -261,7 +263,7 @@ class _HeaderRecords:
         system, scale, left = self._scaling
         if len(names) != min(left, 12) and text[8:10].strip("0 "):
             raise self._fail(
-                f"SYS / SCALE FACTOR: {min(left, 12)} observation types were expected, {len(names)} are listed"
+                f"SYS / SCALE FACTOR: {min(left, 12)} observation types were expected, but {len(names)} are listed"
             )
         for name in names:
             self._scale[system, name] = scale
@@ -283,7 +285,7 @@ class _HeaderRecords:
         """Check SIGNAL STRENGTH UNIT; raise InputFileError if the unit is not DBHZ."""
         unit = text[:20].strip().upper()
         if unit not in ("DBHZ", ""):
-            raise self._fail(f"SIGNAL STRENGTH UNIT: '{unit}' was found, DBHZ was expected")
+            raise self._fail(f"SIGNAL STRENGTH UNIT: the unit is '{unit}'; DBHZ was expected")
 
     def glonass_slots(self, text: str) -> None:
         """Read a record GLONASS SLOT / FRQ #."""

@@ -77,7 +77,7 @@ class NavigationContent:
             if any(values):
                 received[letter] = np.array(values)
             else:
-                self.notes.append(f"ionosphere: the coefficients for {letter} are all zero: not received")
+                self.notes.append(f"ionosphere: the coefficients for {letter} are all zero, so they were not received")
         return received
 
 
@@ -176,14 +176,14 @@ def _read_file(path: FilePath, content: NavigationContent) -> None:
     lines = read_text_lines(path)
     version, kind, begin = read_header(path, lines, content)
     if not any(line.strip() for line in lines[begin:]):
-        raise InputFileError(path, "has a header but no record; the file is cut short; give the complete file")
+        raise InputFileError(path, "has a header but no record, so it is cut short; give the complete file")
     blocks = _blocks_4(path, lines, begin, content) if version >= 4.0 else _blocks(path, lines, begin, version, kind)
     for block in blocks:
         try:
             record = _record(path, block, version, content)
         except InputFileError as error:
             if block.last and "lines," in error.message:
-                content.drop("cut at the end of the file", error)
+                content.drop("records cut short by the end of the file", error)
             else:
                 content.reject(error)
             continue
@@ -264,7 +264,7 @@ def _record(path: FilePath, block: _Block, version: float, content: NavigationCo
     if not fewest <= count <= most:
         fault = "the file is cut or damaged" if count < fewest else "the line that begins the next record is damaged"
         raise InputFileError(
-            path, f"record of {satellite} has {count} lines, {fewest} were expected; {fault}", line=block.line
+            path, f"record of {satellite} has {count} lines, but {fewest} were expected; {fault}", line=block.line
         )
     first = block.text[0]
     lettered = version >= 3.0 or first[:1].isalpha()  # a letter (as in RINEX 2.12) shifts all columns by one

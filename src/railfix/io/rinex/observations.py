@@ -106,7 +106,7 @@ class BlockReader:
         except InputFileError as error:
             if self._log.stops:
                 raise InputFileError(self.path, f"{error.message}; {LENIENT}") from None
-            self._log.note(f"{error}; the data before it were read")
+            self._log.note(f"{error}; the data before this place were read")
             return b"", True
         return block, not block
 
@@ -143,10 +143,12 @@ class BlockReader:
             self._log.count(FURTHER_HEADERS, 1)
             further = parse_header(self.path, records, first_line=number, log=self._log)
             if (further.version < 3.0) != (header.version < 3.0):
-                what = f"a header of RINEX {further.version:g} begins here, the file has RINEX {header.version:g}"
+                what = f"a header of RINEX {further.version:g} begins here, but the file has RINEX {header.version:g}"
                 raise InputFileError(self.path, f"{what}; divide the file at this line", line=number)
             if further.reading != header.reading:
-                self._log.remark(f"{self.path}, line {number}: a further header begins here; applied from here on")
+                self._log.remark(
+                    f"{self.path}, line {number}: another header begins here; it applies to the epochs after it"
+                )
             return further
         return apply_records(self.path, header, records, first_line=number, log=self._log)
 
@@ -205,7 +207,7 @@ def scan_observations(
     are in memory. `progress` is called with the fraction of the files that has been read, 0 to 1.
     """
     if epochs < 1:
-        raise ValueError(f"a piece has at least one epoch, epochs={epochs} was requested")
+        raise ValueError(f"epochs is {epochs}; at least 1 was expected")
     if broken_lines not in get_args(BrokenLines):
         raise ValueError(f"broken_lines is '{broken_lines}', 'stop' or 'count' was expected")
     letters = None if systems is None else frozenset(systems)

@@ -124,7 +124,7 @@ LABELS: Final = frozenset(
 )  # fmt: skip
 #: An epoch has fewer lines than this, because it has fewer than 1000 satellites.
 _MAX_LINES = 1100 * 6
-_CUT_EPOCH_LINE = "the file ends in the middle of an epoch, in its first line"
+_CUT_EPOCH_LINE = "the file ends in the middle of an epoch line"
 
 
 def find_epochs(
@@ -177,7 +177,7 @@ def _find_marked(lines: Lines, *, version: float, at_end: bool, log: FaultLog) -
     log.faults(
         EPOCHS,
         lines.number[line[wrong]],
-        lambda i: f"the epoch declares {head.count[wrong][i]} lines, {room[wrong][i]} follow before the next epoch",
+        lambda i: f"the epoch declares {head.count[wrong][i]} lines, but {room[wrong][i]} follow before the next epoch",
     )
     return _with_events(head[~broken & ~wrong], [*leading, *records.values()]), done
 
@@ -286,7 +286,7 @@ class _Walk:
             return len(self._lines)
         message = (
             f"the epoch of {self._head.count[last]} satellites needs {end - position - 1} lines, "
-            f"{bound - position - 1} follow before the next epoch"
+            f"but {bound - position - 1} follow before the next epoch"
         )
         self._log.fault(EPOCHS, int(self._lines.number[position]), message)
         return bound
@@ -341,5 +341,5 @@ def _no_epoch(lines: Lines, line: int, version: float) -> str:
 def _truncate(needed: int, found: int, lines: Lines, line: int) -> str:
     return (
         f"the file ends in the middle of an epoch: the epoch of line {lines.number[line]} needs {needed} lines, "
-        f"{found} are there"
+        f"but only {found} follow"
     )

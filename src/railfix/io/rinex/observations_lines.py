@@ -94,11 +94,11 @@ FLAWS: Final = (
     "the number of satellites '{count}' is not a number",
     "the fields of the epoch line are not in their columns",
     "the year is not a number",
-    "the month is none of 1 to 12",
+    "the month is not in 1 to 12",
     "the day does not exist in its month",
     "the hour is not in 0 to 23",
     "the minute is not in 0 to 59",
-    "the seconds are not from 0 to below 60",
+    "the seconds are not at least 0 and below 60",
 )
 _SHORT, _FLAG, _COUNT, _PLACES = 1, 2, 3, 4
 

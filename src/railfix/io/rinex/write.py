@@ -101,7 +101,7 @@ PROGRAM = "railfix"
 def header_line(text: str, label: str) -> str:
     """Format one header record. Raise ValueError unless `text` has at most 60 characters, all ASCII."""
     if len(text) > 60 or not text.isascii():
-        raise ValueError(f"{label}: {text!r} is not ASCII of at most 60 characters")
+        raise ValueError(f"{label}: {text!r} is not ASCII text of at most 60 characters")
     return f"{text:<60}{label:<20}\n"
 
 
@@ -255,7 +255,7 @@ def _rows(piece: Observations, columns: Mapping[str, Sequence[str]]) -> list[_Wr
     place = {key: i for i, key in enumerate(zip(names, signals, strict=True))}
     for name, signal in place:
         if not any(column[1:] == signal for column in columns.get(name[0], ())):
-            raise ValueError(f"channel {name} {signal} has no column; name it in `observables`")
+            raise ValueError(f"channel {name} {signal} has no observation type; add one to `observables`")
     rows = []
     for system in sorted(columns):
         satellites = tuple(sorted({name for name in names if name[0] == system}))
