@@ -105,7 +105,7 @@ def reached(item: dict[str, Any]) -> str:
 
 
 def _largest() -> str:
-    cells = [f"{name} {figures('corrected', 'all data', f'G       {name}, SBAS')[8]} m" for name in SINGLE]
+    cells = [f"{figures('corrected', 'all data', f'G       {name}, SBAS')[8]} m ({name})" for name in SINGLE]
     galileo = figures("commercial", "ways without tunnels", "G+J+E   p1 ")[8]
     filtered = [figures("filtered", "ways without tunnels", f"{systems:7s} filter ")[8] for systems in ("G+J", "G+J+E")]
     return (
@@ -115,7 +115,7 @@ def _largest() -> str:
 
 
 def _rate() -> str:
-    cells = [f"{name} {figures('corrected', 'ways without tunnels', f'G       {name}, SBAS')[0]} %" for name in SINGLE]
+    cells = [f"{figures('corrected', 'ways without tunnels', f'G       {name}, SBAS')[0]} % ({name})" for name in SINGLE]
     return ", ".join(cells)
 
 
@@ -127,19 +127,19 @@ def _table_4(*names: str) -> str:
 
 def _figure_7() -> str:
     cells = figures("test-line", "figure 7", "all ")
-    return f"the mean error is {cells[6]} m; conventional positions {cells[0]} m, RTKLIB {cells[3]} m"
+    return f"the mean error is {cells[6]} m; it is {cells[0]} m for conventional positions and {cells[3]} m for RTKLIB"
 
 
 def _seeds() -> str:
     under = {way: figures("seeds", "lines", f"G+J    {way} ")[-3:] for way in ("strict", "RTKLIB")}
     strict, rtklib = " ".join(under["strict"]), under["RTKLIB"][0]
-    return f"no error exceeds 10 m on {strict} lines (`strict`, G+J), and on {rtklib} lines with RTKLIB"
+    return f"with `strict` (G+J), {strict} lines have no error over 10 m; with RTKLIB, {rtklib} lines"
 
 
 def _p4() -> str:
     text = (paths.ROOT / "tests" / "references" / "results" / "p4-experiment.txt").read_text(encoding="utf-8")
     cells = next(line for line in text.splitlines() if line.startswith("ESBC, GPS       0.0")).split()
-    return f"p95 {cells[9]} m east and {cells[12]} m north; least squares {cells[-2]} and {cells[-1]} m"
+    return f"the p95 is {cells[9]} m in east and {cells[12]} m in north; with least squares, {cells[-2]} and {cells[-1]} m"
 
 
 #: Figures that kept outputs hold.
