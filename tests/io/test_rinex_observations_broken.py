@@ -233,7 +233,7 @@ WRONG_FILE: dict[str, tuple[bytes, str]] = {
     "log of a phone": (b"# \n# Header Description:\n# \n# Version: 1.4.0.0, Platform: N\n", "Android's GnssLogger"),
     "position log": (b"% program   : RTKPOST ver.2.4.3\n" * 9, "is an RTKLIB solution"),
     "other text": (b"latitude,longitude\n35.0,139.0\n", "is a table; a RINEX observation file was expected"),
-    "clock file": (text_of([record("     3.00           C", "RINEX VERSION / TYPE")]), "is a RINEX file of clocks"),
+    "clock file": (text_of([record("     3.00           C", "RINEX VERSION / TYPE")]), "is a RINEX clock or"),
     "empty": (b"", "is empty"),
     "blank": (b" \n\n", "is empty"),
     "empty gzip": (gzip.compress(b""), "is empty"),

@@ -200,7 +200,7 @@ def test_what_rinex_cannot_hold_is_refused(tmp_path: Path, table: Observations, 
 
 
 def test_a_channel_without_column_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="G01 2W has no column"):
+    with pytest.raises(ValueError, match="G01 2W has no observation type"):
         write_observations(log(), tmp_path / "a.rnx", observables={s: ["C1C"] for s in "GREJC"})
     with pytest.raises(ValueError, match="X1C"):
         write_observations(log(), tmp_path / "a.rnx", observables={"G": ["X1C"]})

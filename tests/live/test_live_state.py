@@ -70,7 +70,7 @@ def test_a_restart_continues_as_without_one(parts: dict[str, Path], tmp_path: Pa
     state = ["--state", str(tmp_path / "state")]
     whole, _, _ = live(parts["whole"], tmp_path, "whole")
     first, numbers, told = live(parts["first"], tmp_path, "first", *state)
-    assert "not found, positioning starts" in told
+    assert "not found; positioning starts" in told
     rest, later, told = live(parts["rest"], tmp_path, "rest", *state)
     assert "positioning continues 0.1 s after" in told
     assert later == list(range(numbers[-1] + 1, numbers[-1] + 1 + EPOCHS - SPLIT))
