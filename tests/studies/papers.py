@@ -115,7 +115,9 @@ def _largest() -> str:
 
 
 def _rate() -> str:
-    cells = [f"{figures('corrected', 'ways without tunnels', f'G       {name}, SBAS')[0]} % ({name})" for name in SINGLE]
+    cells = [
+        f"{figures('corrected', 'ways without tunnels', f'G       {name}, SBAS')[0]} % ({name})" for name in SINGLE
+    ]
     return ", ".join(cells)
 
 
@@ -139,7 +141,9 @@ def _seeds() -> str:
 def _p4() -> str:
     text = (paths.ROOT / "tests" / "references" / "results" / "p4-experiment.txt").read_text(encoding="utf-8")
     cells = next(line for line in text.splitlines() if line.startswith("ESBC, GPS       0.0")).split()
-    return f"the p95 is {cells[9]} m in east and {cells[12]} m in north; with least squares, {cells[-2]} and {cells[-1]} m"
+    return (
+        f"the p95 is {cells[9]} m in east and {cells[12]} m in north; with least squares, {cells[-2]} and {cells[-1]} m"
+    )
 
 
 #: Figures that kept outputs hold.

@@ -179,7 +179,7 @@ def _one_antenna(path: str, table: pl.DataFrame) -> tuple[pl.DataFrame, tuple[st
         pl.col("DEVICE_ID").eq_missing(pl.lit(device)) & pl.col("ANTENNA").eq_missing(pl.lit(antenna))
     )
     which = f"device {device}, antenna {antenna}"
-    return chosen, (f"{path}: has {len(counts)} devices or antennas; only {which} is used, which has the most rows",)
+    return chosen, (f"{path}: has {len(counts)} devices or antennas; only {which} with the most rows is used",)
 
 
 def _as_arrays(

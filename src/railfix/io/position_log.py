@@ -39,12 +39,12 @@ class PositionLog(NotebookTable):
     """Positions of a log, n rows, in file order unless `railfix.io.positions.read_positions` sorted them by time."""
 
     path: str
-    time: Datetimes  #: GPS time, NaT where the log has no time; shape (n,).
-    ecef_m: Floats  #: ECEF position, NaN where a row has no position or no height; shape (n, 3).
+    time: Datetimes  #: GPS time of each row; NaT where the log has no time, shape (n,).
+    ecef_m: Floats  #: ECEF position; NaN where a row has no position or no height, shape (n, 3).
     #: RTKLIB quality number (manual 2.4.2, B.1): 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP; shape (n,). The
     #: number is -1 where the log has no quality. A CSV log may have other numbers.
     quality: Integers
-    sigma_m: Floats  #: Standard deviations north, east, up, NaN where absent; shape (n, 3).
+    sigma_m: Floats  #: Standard deviations of the position north, east and up; NaN where absent, shape (n, 3).
     line: Integers  #: Line number of each row in the file, shape (n,).
     notes: tuple[str, ...] = ()
     ratio: Floats | None = None  #: Ratio of the ambiguity test, shape (n,); None if the log has no ratios.

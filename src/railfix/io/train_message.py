@@ -147,7 +147,7 @@ def cbor() -> ModuleType:
 
 def encode(message: TrainMessage) -> bytes:
     """Encode a message in CBOR. Equal messages give equal bytes. Fields that are None are omitted."""
-    # keys rise in the order of the fields, which is the canonical order
+    # keys increase in the order of the fields, which is the canonical order
     values = {KEYS[name]: value for name, value in vars(message).items() if value is not None}
     data: bytes = cbor().dumps({_VERSION_KEY: VERSION, **values})
     return data

@@ -36,7 +36,7 @@ from railfix.ranges.sbas import from_receiver
 
 #: Number of received items that may wait to be processed; while this number waits, the sources are paused.
 _LONGEST_QUEUE: Final = 64
-_STATUS_S: Final = 0.5  #: Least time between two updates of the status line [s].
+_STATUS_S: Final = 0.5  #: Interval between two updates of the status line [s].
 
 BASE: Final = "base"  #: Key of the base station's source among the sources.
 

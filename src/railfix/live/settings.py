@@ -79,7 +79,9 @@ class LiveInputs(Settings):
         "ntrip://[USER:PASSWORD@]HOST:PORT/MOUNT (ntrips:// over TLS), or - (standard input).",
         metavar="SOURCE",
     )
-    track: tuple[Path, ...] = input_option("Track map; repeat the option for a route of several maps.", metavar="TRACK")
+    track: tuple[Path, ...] = input_option(
+        "Track map; for a route of several maps, give the option once for each map.", metavar="TRACK"
+    )
     rear: str | None = input_option(
         "Source of the rear antenna's receiver data, as for --front.", None, metavar="SOURCE"
     )
@@ -96,8 +98,8 @@ class LiveInputs(Settings):
         metavar="LAT,LON,HEIGHT",
     )
     tachometer: str | None = input_option(
-        "Source of a tachometer's pulses, as for --front: the rows of the tachometer table of `railfix run` as lines "
-        "of CSV, header first, or the whole table as a file. A row with only a time reports that there was no pulse.",
+        "Source of a tachometer's pulses, in a form of --front. The data are the tachometer table of `railfix run`, "
+        "as lines of CSV with the header first, or as a whole file. A row with only a time reports that there was no pulse.",
         None,
         metavar="SOURCE",
     )

@@ -23,7 +23,7 @@ from railfix.live.settings import LiveSettings
 Item = TypeVar("Item")
 #: Function that returns the present position as a GGA sentence, or empty bytes if there is no position.
 Place = Callable[[], bytes]
-#: Function that writes to the other end of a connection until it is cancelled.
+#: Function that writes to a connection until the function is cancelled.
 Send = Callable[[asyncio.StreamWriter], Coroutine[None, None, None]]
 
 _BLOCK = 4096

@@ -28,8 +28,8 @@ class Ends(NamedTuple):
     #: Position of the front end, positive ahead of the reference point; the middle if several are possible.
     front_m: float
     spread_m: float  #: Largest distance of a possible position of the front end from `front_m`.
-    foremost_m: float  #: Largest distance of any part of the train ahead of the reference point.
-    rearmost_m: float  #: Largest distance of any part of the train behind the reference point.
+    foremost_m: float  #: Distance from the reference point to the farthest part of the train that may be ahead of it.
+    rearmost_m: float  #: Distance from the reference point to the farthest part of the train that may be behind it.
 
 
 @dataclass(frozen=True, kw_only=True)

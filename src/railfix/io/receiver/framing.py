@@ -37,7 +37,7 @@ class Frames:
 
     data: Bytes  #: Buffer that contains the frames.
     protocol: Strings  #: Protocol of each frame, "ubx", "rtcm3", "sbf" or "nmea"; shape (N,).
-    kind: Integers  #: UBX: class * 256 + id; RTCM 3: message number; SBF: block number; NMEA: 0; shape (N,).
+    kind: Integers  #: Message type (UBX: class * 256 + id; RTCM 3: number; SBF: block number; NMEA: 0), shape (N,).
     #: Start and end of the payload in `data`, shape (N,). A UBX or RTCM 3 payload excludes header and checksum; the
     #: RTCM message number is included. An SBF payload begins at the time stamp, after the header of 8 bytes. An NMEA
     #: payload is the text from ``$`` to the character before ``*``.

@@ -378,7 +378,7 @@ def scan_pieces(
                 return
 
 
-_SAME_WEEK: Final = np.timedelta64(5, "D")  #: Largest accepted difference between `date` and the ephemerides' time.
+_SAME_WEEK: Final = np.timedelta64(5, "D")  #: A `date` further than this from the ephemerides' time is rejected.
 
 
 def _week_of_log(path: FilePath, date: np.datetime64 | None) -> np.datetime64:

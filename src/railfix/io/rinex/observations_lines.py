@@ -212,7 +212,7 @@ _CODES_2: Final[dict[str, dict[str, str]]] = {
     "S": {"C1": "1C", "C5": "5X", "CA": "1C"},
     "I": {"C5": "5A", "C9": "9A"},
 }
-#: Codes of each RINEX 2 band; the signal of phase, Doppler and C/N0 is that of the first code that is declared.
+#: Codes of each RINEX 2 band. Phase, Doppler and C/N0 are assigned to the signal of the first code that is declared.
 _OWNERS_2: Final[dict[str, tuple[str, ...]]] = {"1": ("C1", "P1"), "2": ("P2", "C2")}
 
 
