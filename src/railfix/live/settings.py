@@ -99,7 +99,7 @@ class LiveInputs(Settings):
     )
     tachometer: str | None = input_option(
         "Source of a tachometer's pulses, in a form of --front. The data are the tachometer table of `railfix run`, "
-        "as lines of CSV with the header first, or as a whole file. A row with only a time reports that there was no pulse.",
+        "as lines of CSV, header first, or as a whole file. A row with only a time reports that there was no pulse.",
         None,
         metavar="SOURCE",
     )
