@@ -1,4 +1,4 @@
-"""railfix: satellite train positioning on a 3-D track map.
+"""railfix: GNSS positioning of trains on a 3-D track map.
 
 A train runs on a known line. The train's antenna therefore lies on a known 3-D curve, and its position is one
 coordinate along this curve. railfix turns raw receiver logs (RINEX) and a track map into positions along the line, and
@@ -17,7 +17,7 @@ Where to begin
 >>> result, state = processor.process({"front": railfix.read_observations(files["front"])})
 >>> railfix.train_table(result)  # chainage, sigma, protection level, status of every epoch
 
-The median error of these positions is 0.34 m against the ground truth of the simulated run.
+The files are from a simulated run. The median error of these positions is 0.34 m against the ground truth of the run.
 
 ============================ =========================================================================
 read                         `read_observations`, `read_navigation`, `read_track`, `read_vehicle`,
@@ -39,20 +39,20 @@ commands. Every name is imported at its first use, so that ``import railfix`` is
 Vocabulary
 ----------
 epoch
-    One instant at which a receiver reports. Epochs are on axis 0 of arrays, with length T.
+    One instant at which a receiver reports. Axis 0 of arrays has the epochs; its length is T.
 channel
-    One satellite on one signal. Channels are on axis 1 of arrays, with length M.
+    One signal of one satellite. Axis 1 of arrays has the channels; its length is M.
 ECEF
-    Earth-centred Earth-fixed frame, WGS 84 [m]; the last axis of length 3 is x, y, z.
+    Earth-centred Earth-fixed frame, WGS 84 [m]; the last axis of an array has length 3 (x, y, z).
 chainage
-    Distance along the antenna's trajectory or the track from its first point [m].
+    Distance along the track (or an antenna's trajectory) from the first point of the track (or the trajectory) [m].
 kilometrage
     Distance as marked along the line [m]; it may jump or run backwards.
 GPS time
     The only internal time scale, stored as ``datetime64[ns]``.
 
 Public names end with the unit of the quantity: ``_m``, ``_deg``, ``_s``, ``_hz``, ``_dbhz``, ``_ecef_m``. Absent values
-are NaN (NaT for times); 0 is a value. In every rejection mask, True means rejected.
+are NaN (NaT for times), never 0. In every rejection mask, True means rejected.
 """
 
 import lazy_loader

@@ -155,7 +155,7 @@ def _rewritten(old: str, new: str) -> Callable[[Path], object]:
         (_rewritten('"other.pos" =', '"another.pos" ='), SettingsError, "sha256 has no entry for other.pos; add its"),
         (_rewritten("held_out = false\n", ""), SettingsError, "case.toml: setting held_out is missing"),
         (_rewritten("licence =", "license ="), SettingsError, "unknown setting license.* is 'licence' meant"),
-        (_rewritten('truth = "truth.csv"\n', ""), SettingsError, "setting files.truth is missing; name the ground"),
+        (_rewritten('truth = "truth.csv"\n', ""), SettingsError, "setting files.truth is missing; give the file"),
         (_rewritten('truth = "', 'cn0_curve = "c.toml"\ntruth = "'), SettingsError, "files.cn0_curve is a setting"),
         (lambda case: (case / "case.toml").write_text("= 1"), InputFileError, "case.toml: is not valid TOML"),
     ],

@@ -608,7 +608,7 @@ def test_errors_of_the_command(tmp_path: Path, change: list[str], code: int, tol
     [
         (lambda run: (run / "run.json").unlink(), r"run\.json: there is no such file"),
         (lambda run: (run / "run.json").write_text("{"), r"run\.json: is not valid JSON"),
-        (lambda run: (run / "positions.parquet").unlink(), "holds neither positions.parquet nor positions.csv"),
+        (lambda run: (run / "positions.parquet").unlink(), "contains neither positions.parquet nor positions.csv"),
         (lambda run: (run / "positions.parquet").write_bytes(b"PAR1"), "cannot be read as a table"),
         (
             lambda run: (
@@ -620,7 +620,7 @@ def test_errors_of_the_command(tmp_path: Path, change: list[str], code: int, tol
             lambda run: pl.concat([pl.read_parquet(run / "positions.parquet")] * 2).write_parquet(
                 run / "positions.parquet"
             ),
-            "twice at one time",
+            "two rows of one antenna at one epoch",
         ),
     ],
 )

@@ -71,4 +71,4 @@ def test_the_drive_is_a_held_out_case_that_says_how_good_its_reference_is(
     case.check_hashes()
     assert case.content.held_out
     assert case.content.scenario.reference == quality
-    assert "differs from RTKLIB's more accurate solution by 11 m (95 %)" in quality
+    assert "differs from RTKLIB's more accurate solution by 11 m (95th percentile)" in quality

@@ -356,4 +356,4 @@ def test_measured_priors_are_those_of_a_run_with_the_model(tmp_path: Path) -> No
     assert (own.risk.priors, own.risk.local_prior, own.no_level_m) == ("assumed", 2e-5, ())
     short = fault_rate(samples_of(np.zeros(4000), 60.0, 0.0, 45.0))
     assert short.side_upper == 1.0
-    assert "stay indicative" in priors_text(short)
+    assert "are only indicative" in priors_text(short)

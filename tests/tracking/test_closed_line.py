@@ -279,5 +279,5 @@ def test_errors_across_the_join_are_the_short_way_round_by_both_methods(tmp_path
         error = found.epochs["error_m"].to_numpy()
         assert error[:3] == pytest.approx([7.0, -7.0, 1.0], abs=0.05)
         assert error[3] > 500.0
-        told = "in the shorter direction" if method == "chainage" else "2 of 4 errors were measured to the"
+        told = "in its shorter direction" if method == "chainage" else "2 of 4 errors were measured to the"
         assert any(told in note for note in found.runs[0].notes), found.runs[0].notes

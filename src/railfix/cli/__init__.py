@@ -24,26 +24,26 @@ class _Program(LazyCommands):
     """Top-level group of commands, with a one-line summary and the module of each command."""
 
     summaries: ClassVar[Mapping[str, str]] = {
-        "run": "Position receiver logs along the line.",
+        "run": "Compute positions along the line from receiver logs.",
         "doctor": "Identify files, check that they fit together, and print the command to run.",
         "explain": "Explain one epoch of a run: its satellites, sigma, protection level and status.",
         "export": "Write the positions of a run as KML, GPX, GeoJSON, GeoPackage, GeoParquet or MCAP.",
-        "campaign": "Position many logs in parallel; an interrupted campaign is continued.",
-        "benchmark": "Run a folder of cases, and evaluate railfix and other programs with the same code.",
-        "demo": "Position the demonstration log and compare it with its ground truth.",
+        "campaign": "Compute positions from many logs in parallel; continue an interrupted campaign.",
+        "benchmark": "Run a folder of cases, and evaluate railfix and other programs in the same way.",
+        "demo": "Compute positions from the demonstration log, and compare them with the ground truth.",
         "ablate": "Compare the screens on a log: all together, none, each screen alone, and all but one.",
         "evaluate": "Compute errors of runs against references.",
         "reference": "Build a reference trajectory from RTK fixed positions, and bridge its gaps.",
-        "live": "Position a train from its receivers' streams as they arrive.",
+        "live": "Compute the positions of a train from its receivers' streams as they arrive.",
         "locate": "Compute 3-D positions from a log, without a track map.",
-        "which-track": "Decide on which track a train at rest is.",
+        "which-track": "Determine the track on which a train stands.",
         "convert": "Write receiver logs as RINEX files.",
-        "cn0-curve": "Fit the mean C/N0 over elevation of an antenna and receiver.",
-        "error-model": "Model the pseudorange errors of a line from runs with references.",
+        "cn0-curve": "Fit the mean C/N0 of an antenna and receiver as a function of satellite elevation.",
+        "error-model": "Model the pseudorange errors along a line from runs with references.",
         "plot-screens": "Plot each screen's metric against its limit.",
         "simulate": "Simulate runs with ground truth.",
         "report": "Write an HTML report on runs.",
-        "ground": "Monitor satellites with a reference triangle; supervise trains from the ground.",
+        "ground": "Monitor satellites with three reference receivers; supervise trains from the ground.",
         "map": "Check or make a track map, or match positions to a network of tracks.",
     }
     modules: ClassVar[Mapping[str, str]] = {
@@ -90,7 +90,7 @@ def railfix(
         ),
     ] = False,
 ) -> None:
-    """Compute the positions of a train along its line from satellite receiver logs and a 3-D track map.
+    """Compute the positions of a train along its line from GNSS receiver logs and a 3-D track map.
 
     A train runs on a known line, so its antenna lies on a known curve and its position is one number, the chainage.
     railfix reads receiver logs, navigation files and a track map, and writes the chainage of every epoch, its
@@ -105,11 +105,11 @@ def railfix(
     - 2: the command line is wrong (unknown option, missing argument)
     - 3: an input file is missing, unreadable, or malformed
     - 4: a setting is misspelt, out of range, or contradicts another setting
-    - 5: the inputs are readable but do not match each other, for example in day or location
+    - 5: the inputs are readable but do not match each other, for example because they are from different days or places
     - 6: the track map was checked and has errors
-    - 7: the results contain no position, or the inputs no usable position
+    - 7: the results contain no position, or the inputs contain no usable position
     - 8: the output cannot be written
-    - 9: two channels of a live session computed different outputs from the same input
+    - 9: the two processing channels of a live session computed different outputs from the same input
 
     After a signal, the exit code is 128 plus the number of the signal: 143 for SIGTERM, or 141 for SIGPIPE if the
     program that reads the output ends first.

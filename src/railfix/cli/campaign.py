@@ -53,16 +53,16 @@ def campaign(
         typer.Option(
             "--scheduler",
             metavar="ADDRESS",
-            help="Dask scheduler, tcp://HOST:PORT, whose workers have access to the same files (extra `cluster`).",
+            help="Dask scheduler, tcp://HOST:PORT, whose workers have access to the same files (with extra `cluster`).",
         ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    r"""Position all logs of a campaign, each run into its own folder; an interrupted campaign is continued.
+    r"""Compute positions from all logs of a campaign, with one folder per run; an interrupted campaign is continued.
 
-    CAMPAIGN.toml has patterns of paths, relative to the folder of this file, with fields in braces. Logs with the same
-    values of all fields form one run. A navigation file is assigned to the runs that have the same values in the fields
-    of its pattern:
+    CAMPAIGN.toml has patterns of paths with fields in braces; paths are relative to the folder of this file. Logs with
+    the same values of all fields form one run. A navigation file is used for all runs whose fields have the values in
+    its path:
 
         front = "logs/{train}/{day}/front.obs*"
         rear = "logs/{train}/{day}/rear.obs*"
@@ -72,8 +72,8 @@ def campaign(
         config = "settings.toml"
         reference = "logs/{train}/{day}/truth.csv"
 
-    `track`, `vehicle` and the sensors' tables (`tachometer`, `inertial`, `radar`) may have fields too. The options of
-    `railfix run` are written in tables; for a KML map and logs with broken lines, for example:
+    `track`, `vehicle` and the sensors' tables (`tachometer`, `inertial`, `radar`) may have fields too. Options of
+    `railfix run` are written in TOML tables. An example for a KML map and logs with damaged text lines:
 
         [options.track]
         height_datum = "orthometric"
@@ -81,11 +81,11 @@ def campaign(
         [options.logs]
         broken_lines = "count"
 
-    Each run has a folder with the files of `railfix run`, such as `DIR/runs/train=A/day=2024-03-05/`; together, these
-    folders are one hive-partitioned data set. `campaign.csv` has one row per run, with the error message of a run that
-    fails. The page `campaign.html` shows the lines, the protection levels and (with `reference`) the errors of each
-    run, and explains the ten worst epochs. A run is not repeated if results for the same inputs, settings and options
-    exist.
+    Each run has a folder with the files that `railfix run` writes, such as `DIR/runs/train=A/day=2024-03-05/`;
+    together, these folders are one hive-partitioned data set. `campaign.csv` has one row per run, with the error
+    message of a run that fails. The page `campaign.html` shows the lines, the protection levels and (with `reference`)
+    the errors of each run, and explains the ten worst epochs. A run is not repeated if results for the same inputs,
+    settings and options exist.
 
     Example: `railfix campaign line.toml --out results --workers 8`
 
@@ -181,7 +181,7 @@ def open_executor(workers: int, scheduler: str | None) -> Iterator[tuple[Executo
 def benchmark(
     *,
     folder: Annotated[
-        Path, typer.Argument(metavar="FOLDER", help="Folder with one subfolder per case, which has a `case.toml`.")
+        Path, typer.Argument(metavar="FOLDER", help="Folder with one subfolder per case, each with a `case.toml`.")
     ],
     choices: Choices,
     out: OutOption,
@@ -189,8 +189,8 @@ def benchmark(
 ) -> None:
     r"""Run the cases of a folder with one configuration, and compare them with other programs.
 
-    `case.toml` names the files of a case, relative to the folder of the case, with their SHA-256. A file with a
-    different SHA-256 is rejected. The keys of `files` are the options of `railfix run`, and `truth` for the ground
+    `case.toml` lists the files of a case and their SHA-256; paths are relative to the folder of the case. A file with a
+    different SHA-256 is rejected. The keys of `files` are names of options of `railfix run`, or `truth` for the ground
     truth:
 
         licence = "CC BY 4.0"
@@ -209,10 +209,10 @@ def benchmark(
         [sha256]
         "rover.rnx" = "2c26b46b..."
 
-    `positions` are logs of positions that other programs have computed (RTKLIB, NMEA, CSV). These positions are moved
-    to the nearest point of the line and evaluated with the same code. If `rnx2rtkp` is installed, the single-point
-    positions of RTKLIB are computed and evaluated in this way, too. `scenario` describes the recording as EN 16803-2
-    requires for record and replay. `options` has options of `railfix run`, and `evaluation` has options of `railfix
+    `positions` lists files with positions computed by other programs (RTKLIB, NMEA, CSV). These positions are moved to
+    the nearest point of the line and evaluated in the same way as the positions of railfix. If `rnx2rtkp` is installed,
+    single-point positions are also computed with RTKLIB and evaluated. `scenario` describes the recording as EN 16803-2
+    requires for record and replay. `options` sets options of `railfix run`, and `evaluation` sets options of `railfix
     evaluate`. A case with `held_out` is reserved for the benchmark: settings derived from its files are rejected.
 
     `benchmark.csv`, `benchmark.json`, `benchmark.md` and the folders of the runs are written into DIR. A run is not
@@ -227,7 +227,7 @@ def benchmark(
 
 
 def show_benchmark(folder: Path, config: Config, *, out: Path, workers: int) -> None:
-    """Run the cases of a folder, and print the table, the notes and the files.
+    """Run the cases of a folder, and print the table, the notes and the names of the written files.
 
     Raise NoPositionError if every case has failed, and MismatchError if some cases have failed.
     """
@@ -236,7 +236,7 @@ def show_benchmark(folder: Path, config: Config, *, out: Path, workers: int) -> 
         table, notes = run_benchmark(folder, config, out=out, executor=executor, progress=show_progress, lost=lost)
     console = TableConsole()
     head = ["\n".join(pair) for pair in zip(*heads(), strict=True)]
-    caption = "Errors in metres, along the line and in 3-D; below each error, the performance feature of EN 16803-1"
+    caption = "Errors in metres, along the line and in 3-D; below each heading, the performance feature of EN 16803-1"
     show_table(console, plain_table(head, shown_rows(table), caption, texts=2))
     show_notes(console, notes)
     show_files(console, [out / f"benchmark.{kind}" for kind in ("csv", "json", "md")])
@@ -260,18 +260,18 @@ def ablate(
 
     The logs are read once. Screens that are off in the settings stay off. Screens that cannot be run (no second
     antenna, no C/N0 curve) are left out and reported. The validity and health of satellites are checked in every case;
-    `none` applies only these checks, and no elevation mask.
+    with `none`, no other check is made, and there is no elevation mask.
 
-    With `--filter track`, the table also has rows of the filter along the track with all screens: one row with all
+    With `--filter track`, the table also has rows for the filter along the track, with all screens on: one row with all
     available sources (codes, phases, Dopplers, and the given sensors), and, for each source except codes, one row
     without this source.
 
     For each selection of screens, the table shows the fractions of epochs with coordinates and of epochs with status
     ok, the number of satellites used, and the median standard deviation along the line. With `--truth`, the table also
     shows errors along the line for three groups: all epochs with coordinates, epochs with status ok, and epochs without
-    satellites. An error over 50 m counts as a wrong position. A further column is the 95th percentile of the ratio of
-    error to stated sigma. `ablation.csv` in DIR has all figures, also for the conventional positions; `ablation.json`
-    has the versions, inputs and settings.
+    satellites. A position with an error over 50 m counts as wrong. A further column is the 95th percentile of the ratio
+    of error to stated sigma. `ablation.csv` in DIR has all statistics, also of the conventional positions (3-D single
+    point); `ablation.json` has the versions, inputs and settings.
 
     Example:
 

@@ -25,7 +25,7 @@ from railfix.core.extras import needs_extra
 
 #: Words that users mistakenly write after a switch as its value.
 _YES_NO: Final = ("true", "false", "yes", "no", "on", "off", "0", "1")
-#: A program that was ended by a signal has this exit code plus the number of the signal, as in POSIX shells.
+#: The exit code of a program that was ended by a signal is this value plus the signal's number, as in POSIX shells.
 SIGNALLED: Final = 128
 #: Pattern of the message of `pathlib` for a symbolic link that leads to itself.
 _LOOP: Final = re.compile(r"Symlink loop from '(.*)'")
@@ -98,7 +98,7 @@ class Commands(TyperGroup):
             _end(InputFileError(loop.group(1), "is a symbolic link that leads to itself; make it a link to a file"))
 
 
-#: Options of every typer application of this package; rich formats the help but not the tracebacks.
+#: Options of every typer application of this package; the package `rich` formats the help but not the tracebacks.
 _TYPER: Final[dict[str, Any]] = {
     "add_completion": False, "pretty_exceptions_enable": False, "rich_markup_mode": "markdown"
 }  # fmt: skip
@@ -113,7 +113,7 @@ class LazyCommands(Commands):
     """Group that imports a command's module only when the command is called; the help is made from `summaries`."""
 
     summaries: ClassVar[Mapping[str, str]] = {}
-    #: Modules of the commands whose module has another name than the command.
+    #: Module of each command that is in a module with a different name, by name of the command.
     modules: ClassVar[Mapping[str, str]] = {}
 
     def list_commands(self, ctx: Any) -> list[str]:
@@ -121,7 +121,7 @@ class LazyCommands(Commands):
         return [*super().list_commands(ctx), *self.summaries]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return a command; for a name in `summaries`, it is a placeholder with name and summary, for the help."""
+        """Return a command; for a name in `summaries`, a placeholder with only name and summary, for the help."""
         if cmd_name in self.summaries:
             return Command(cmd_name, help=self.summaries[cmd_name])
         return super().get_command(ctx, cmd_name)
@@ -179,7 +179,7 @@ def run_program(app: typer.Typer) -> NoReturn:
 def _end_at_closed_pipe(number: int, _frame: object) -> None:
     """Exit if the reader of standard output has closed the pipe.
 
-    Otherwise another pipe is broken. The function then returns, so that the write to this other pipe raises its error.
+    If the reader exists, another pipe is broken; the function then returns, so that the write to it raises its error.
     """
     poll = select.poll()
     poll.register(1, 0)

@@ -48,10 +48,10 @@ def print_json(values: Mapping[str, Any]) -> None:
 
 
 def list_antenna_errors(evaluation: Evaluation) -> list[dict[str, Any]]:
-    """Return the error statistics of the positions on the map over all epochs, one row per run and antenna.
+    """Return the error statistics of the positions computed with the map, over all epochs, one row per run and antenna.
 
-    Rows of the filter come before rows of single epochs. In both groups, rows without errors come first, and the other
-    rows are in descending order of the 95th percentile of the error.
+    Rows of the filter come before rows of single epochs. In both groups, rows for which no error could be computed come
+    first; the other rows are in descending order of the 95th percentile of the error.
     """
     rows = evaluation.figures.filter(
         pl.col("grouping") == "all", pl.col("epochs_of") == "own", pl.col("position") == "constrained",
@@ -62,7 +62,7 @@ def list_antenna_errors(evaluation: Evaluation) -> list[dict[str, Any]]:
 
 
 def verdict_of_evaluation(evaluation: Evaluation) -> list[str]:
-    """Return at most `_MOST` lines: the accuracy of each run and antenna, largest errors first, then the next command.
+    """Return at most `_MOST` lines: accuracy of each run and antenna, largest errors first, then a command to use next.
 
     Each line on accuracy also reports whether the stated sigma fits the errors.
     """
@@ -112,8 +112,8 @@ def _judge(row: Mapping[str, Any]) -> str:
     if not row["errors"]:
         return f"{name}: no position has a reference"
     text = (
-        f"{name}: error {row['p50_m']:.2f} m at the median, {row['p95_m']:.2f} m for 95 % of {row['errors']:,}, "
-        f"largest {row['max_m']:.2f} m"
+        f"{name}: error {row['p50_m']:.2f} m at the median, {row['p95_m']:.2f} m for 95 % of {row['errors']:,} "
+        f"epochs, largest {row['max_m']:.2f} m"
     )
     if row["max_at_chainage_m"] is not None:
         text += f" at chainage {row['max_at_chainage_m']:.0f} m"
@@ -133,7 +133,7 @@ def prepare_kernels() -> None:
 
 #: Width of tables in characters if the output is not a terminal; no cell is cut or folded at this width.
 _FILE_WIDTH: Final = 500
-#: Largest number of map findings that are printed; further findings are only counted.
+#: Maximum number of printed map findings; further findings are only counted.
 MOST_FINDINGS: Final = 40
 #: Replacements for characters that some terminals cannot show.
 _PLAIN: Final = str.maketrans("−–", "--")
@@ -235,7 +235,7 @@ def show_files(console: Console, paths: Iterable[Path]) -> None:
 def progress_bar(work: str = "positions") -> Iterator[ProgressCall]:
     """Yield the function that updates a progress bar on standard error.
 
-    The bar is shown only if standard error is a terminal. It has the number of epochs, the rate in epochs/s and the
+    The bar is shown only if standard error is a terminal. It shows the number of epochs, the rate in epochs/s and the
     remaining time.
     """
     console = Console(stderr=True)

@@ -1,4 +1,4 @@
-"""``railfix demo``: position the demonstration run and compare it with its ground truth."""
+"""``railfix demo``: compute the positions of the demonstration run and compare them with the ground truth."""
 
 from __future__ import annotations
 
@@ -39,25 +39,25 @@ def demo(
     overwrite: OverwriteOption = False,
     verbose: VerboseOption = False,
 ) -> None:
-    """Position the log that comes with railfix, and compare the positions with the ground truth.
+    """Compute positions from the log that comes with railfix, and compare them with the ground truth.
 
     The log is a simulated run of a train with two antennas on a line with curves and cant; the README in the folder of
-    the log describes the run. The log is positioned as by `railfix run`. As with `railfix report`, a page compares the
-    positions on the map with the ground truth. The conventional positions (3-D single points from unscreened ranges,
-    moved to the nearest point of the line) are also compared.
+    the log describes the run. The log is processed as `railfix run` does. A page, as `railfix report` writes, compares
+    the positions computed with the map, and the conventional positions (3-D single points from unscreened ranges, moved
+    to the nearest point of the line), with the ground truth.
 
     The run's `positions.csv`, `positions.parquet`, `train.csv`, `train.parquet`, `observations.parquet` and `run.json`
-    are written into DIR. Further outputs are the folder `unscreened`, with the run for the conventional positions, and
-    the page `report.html`, to open in a browser.
+    are written into DIR. Further outputs are the folder `unscreened`, which has the conventional positions, and the
+    page `report.html`, to open in a browser.
 
-    With `--real`, the log is a car's drive of 20 minutes through a town, from the wheel `gnss-benchmark` (MIT). pip
-    downloads the wheel, which is kept unpacked in the user's cache. The map is made from the drive's ground truth,
-    which is computed by RTKLIB if it is installed. `railfix benchmark` evaluates the positions of railfix and of RTKLIB
-    against the ground truth. The case is written into `DIR/drive`, and the results into `DIR/benchmark`.
+    With `--real`, the log is a 20-minute drive of a car through a town, from the Python package `gnss-benchmark` (MIT
+    licence), which pip downloads and the user's cache keeps. The map is made from the ground truth: a trajectory
+    computed with RTKLIB if it is installed, otherwise the publisher's trajectory. As with `railfix benchmark`, railfix
+    and RTKLIB are evaluated; the case is written into `DIR/drive`, and the results into `DIR/benchmark`.
 
     Example: `railfix demo --out first-look`
 
-    Exit codes are listed in `railfix --help`; with `--real` the code is also 3 if the drive cannot be downloaded.
+    Exit codes are listed in `railfix --help`; with `--real` the code is also 3 if the recording cannot be downloaded.
     """
     if real:
         from railfix.cli.campaign import show_benchmark
@@ -72,7 +72,7 @@ def demo(
     with progress_bar() as progress:
         options = RunOptions(observations="write", overwrite=overwriting(overwrite), chunk_epochs=200)
         summary = run_files(inputs, Config(), out=out, options=options, progress=progress)
-    # as in P1, conventional positions are computed from ranges that are not screened
+    # as in paper P1, conventional positions are computed from ranges that are not screened
     unscreened = Config(filter="off", screens=("elevation",), protection="off")
     run_files(inputs, unscreened, out=out / "unscreened", options=options.replaced(observations="skip"))
     runs, evaluation = read_runs([out], [demo_truth()], conventional=[out / "unscreened"])

@@ -63,7 +63,7 @@ _MOST_BEYOND: Final = 5  #: Maximum number of printed epochs with an error above
 def show_evaluation(evaluation: Evaluation, files: dict[str, Path], *, verbose: bool) -> None:
     """Print the verdict, the references of each run, the tables, and the paths of the written files.
 
-    Without `verbose`, only the tables in `_MAIN_TABLES` are printed, and the Stanford counts if there are alarm limits.
+    Without `verbose`, only `_MAIN_TABLES` and (if there are alarm limits) the Stanford counts are printed.
     """
     console = TableConsole()
     show_verdict(console, verdict_of_evaluation(evaluation))
@@ -72,7 +72,7 @@ def show_evaluation(evaluation: Evaluation, files: dict[str, Path], *, verbose: 
         for antenna, method in run.method.items():
             by = "differences of chainage" if method == "chainage" else "along the trajectory"
             outside = plural(run.outside[antenna], "epoch")
-            console.print(f"  {antenna}: against {run.reference}, {by}; {outside} outside the reference")
+            console.print(f"  {antenna}: compared with {run.reference}, {by}; {outside} not covered by the reference")
         show_notes(console, run.notes)
     levels, groups = level_tables(evaluation, worst=_MOST_BEYOND), group_tables(evaluation)
     tables = [*error_tables(evaluation), *levels, *groups]
@@ -108,18 +108,18 @@ def evaluate(
     r"""Compute the along-track errors of runs against references, and statistics of these errors.
 
     The error is the distance along the line from the reference to the position, positive toward the end of the line in
-    either direction of travel. The tables have three kinds of positions: the positions on the map, the positions with
-    status ok, and the conventional positions (3-D single point, moved to the nearest point of the line). The statistics
-    are computed over all positions of each kind, and over the epochs with positions of all kinds. Errors are grouped by
-    antenna, section, environment, speed, number of satellites used, whether satellites were used, and status. With
-    several runs, they are also grouped by configuration and line.
+    either direction of travel. The tables have three kinds of positions: those computed with the map, those with status
+    ok, and conventional positions (3-D single point, moved to the nearest point of the line). The statistics are
+    computed over all positions of each kind, and over the epochs that have a position of each of the three kinds.
+    Errors are grouped by antenna, section, environment, speed, number of satellites used, whether satellites were used,
+    and status. With several runs, they are also grouped by configuration and line.
 
-    `evaluation.json` in DIR has all figures, the options and the hashes of the inputs; `errors.parquet` has one row per
-    epoch and antenna. Further files are `tables.csv` and `intervals.csv`. For a run with protection levels,
-    `levels.csv`, `stanford_KIND.csv` (protection levels against errors, counted at each alarm limit) and
-    `beyond_KIND.csv` (every epoch with an error above the protection level) are also written; KIND is `sbas`,
+    `evaluation.json` in DIR has all statistics, the options and the hashes of the inputs; `errors.parquet` has one row
+    per epoch and antenna. Further files are `tables.csv` and `intervals.csv`. For a run with protection levels,
+    `levels.csv`, `stanford_KIND.csv` (number of epochs in each region of the Stanford diagram, for each alarm limit)
+    and `beyond_KIND.csv` (every epoch with an error above the protection level) are also written; KIND is `sbas`,
     `separation` or `train`. For the filter along the track, `outages.csv` has the stretches without satellites, and
-    `branches.csv` compares the stated probabilities of branches with how often the branches were correct.
+    `branches.csv` compares the stated probability of a branch with the frequency at which the branch was correct.
 
     Example:
 
@@ -237,14 +237,15 @@ def error_model(
 ) -> None:
     """Model the errors that corrected pseudoranges have on a line because of multipath and receiver noise.
 
-    Each RUN is positioned again with the settings of the run. The error of a pseudorange is the pseudorange minus the
-    receiver clock and the distance between satellite and reference position. With `--base`, the error of the same
+    The positions of each RUN are computed again with its settings. The error of a pseudorange is the pseudorange minus
+    the receiver clock and the distance between satellite and reference position. With `--base`, the error of the same
     satellite at a nearby reference station is also subtracted. Without `--base`, the model includes the orbit, clock
-    and atmospheric errors of the recorded days; it is then wider, and valid only for days with similar errors.
+    and atmospheric errors of the recorded days; its standard deviations are then larger, and it is valid only for days
+    with similar errors.
 
     The file has the bias, the standard deviation and a Gaussian overbound for every bin of elevation, C/N0, and azimuth
-    relative to the front of the car. All three are stated before and after the screens. `railfix run --error-model
-    MODEL.toml` derives the protection level from the model.
+    relative to the front of the car. Bias, standard deviation and overbound are stated before and after the screens.
+    `railfix run --error-model MODEL.toml` derives the protection level from the model.
 
     Example: `railfix error-model results --reference reference.csv --base 0759.obs --out line.toml`
 
@@ -274,13 +275,12 @@ def priors_text(rate: FaultRate) -> str:
     """Return a sentence on the fault priors that a run with this model assumes."""
     if not rate.bounds_priors:
         return (
-            f"Too few blocks to bound both priors by {LARGEST_PRIOR:g}: protection levels of runs with this model stay "
-            "indicative, unless settings state risk.local_prior and risk.side_prior"
+            f"Too few blocks to show that both priors are below {LARGEST_PRIOR:g}: protection levels of runs with "
+            "this model are only indicative, unless settings state risk.local_prior and risk.side_prior"
         )
     return (
-        f"Runs with this model (--error-model) use risk.local_prior = {rate.upper:.2g} and "
-        "risk.side_prior = "
-        f"{rate.side_upper:.2g} as measured, unless settings state these priors"
+        f"Runs with this model (--error-model) use the measured values risk.local_prior = {rate.upper:.2g} and "
+        f"risk.side_prior = {rate.side_upper:.2g}, unless settings state these priors"
     )
 
 
@@ -288,7 +288,7 @@ def _print_model(model: ErrorModel, samples: ErrorSamples) -> None:
     console = TableConsole()
     base = model.source.base or "none, so that satellite and atmospheric errors are part of the model"
     console.print(
-        f"{len(samples.error_m):,} pseudoranges of {model.source.epochs:,} epochs; reference station: {base}; in metres"
+        f"{len(samples.error_m):,} pseudoranges of {model.source.epochs:,} epochs; in metres; reference station: {base}"
     )
     figures = [[f"{when}\ncount", "\nbias", "\nsigma", "\nbound"] for when in ("before", "after")]
     head = ["before and\nafter screens", *figures[0], *figures[1]]
@@ -296,17 +296,16 @@ def _print_model(model: ErrorModel, samples: ErrorSamples) -> None:
     if (rate := model.faults) is not None:
         console.print(
             f"local faults: errors of {rate.faulty} of {rate.ranges:,} used ranges exceed {rate.beyond_sigma:g} times "
-            f"the sigma of the protection level (fraction {rate.prior:.2g}; {rate.faulty_blocks} of {rate.blocks:,} "
-            f"blocks; at most {rate.upper:.2g} with 95 % confidence). Two satellites are faulty together "
-            f"{rate.together:.1f} times as often as independent satellites would be. Low satellites on one side of the "
-            f"track are faulty together in {rate.side_faulty_blocks} of {rate.side_blocks:,} blocks (side_prior at "
-            f"most {rate.side_upper:.2g}). "
-            f"{priors_text(rate)}"
+            f"the sigma of the protection level (fraction {rate.prior:.2g}, at most {rate.upper:.2g} with 95 % "
+            f"confidence; {rate.faulty_blocks} of {rate.blocks:,} blocks have such errors). Two satellites are faulty "
+            f"together {rate.together:.1f} times as often as independent satellites would be. Low satellites on one "
+            f"side of the track are faulty together in {rate.side_faulty_blocks} of {rate.side_blocks:,} blocks "
+            f"(side_prior at most {rate.side_upper:.2g}). {priors_text(rate)}"
         )
         if stretches := ", ".join(f"[{start:g}, {end:g}]" for start, end in rate.no_level_m):
             console.print(
-                f"local faults are more frequent than on the line at chainages [m] {stretches}: runs that use the "
-                "priors of this model have no protection level there"
+                f"at chainages [m] {stretches}, local faults are more frequent than on the whole line: runs that use "
+                "the priors of this model have no protection level there"
             )
 
 
@@ -323,7 +322,7 @@ def cn0_curve(
     ],
     out: Annotated[Path, typer.Option("--out", metavar="CURVE.toml", help="File for the curve.")],
     plot: Annotated[
-        Path | None, typer.Option(metavar="PNG", help="Picture of the samples, the mean C/N0 and the threshold.")
+        Path | None, typer.Option(metavar="PNG", help="Plot of the samples, the mean C/N0 and the threshold.")
     ] = None,
     position: Annotated[
         str | None,
@@ -336,12 +335,12 @@ def cn0_curve(
     reading: LogReading,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Fit the mean C/N0 over elevation of one antenna and receiver.
+    """Fit the mean C/N0 of one antenna and receiver as a function of satellite elevation.
 
     Record about a day under open sky with the antenna and the receiver of the train, because the curve is valid only
     for this antenna and receiver. One curve is fitted per constellation and signal. The file also names the inputs.
-    With the curve, positioning rejects signals that are 10 dB-Hz below the mean at the same elevation; without a curve,
-    only a fixed minimum of the C/N0 can be applied.
+    With the curve, positioning rejects signals more than 10 dB below the mean at their elevation; without a curve, only
+    a fixed minimum of the C/N0 can be applied.
 
     Example: `railfix cn0-curve roof.crx.gz --nav roof.rnx.gz --out roof.toml --plot roof.png`
 

@@ -1,4 +1,4 @@
-"""``railfix ground``: satellite monitoring with a reference triangle, and train supervision by a control centre."""
+"""``railfix ground``: satellite monitoring with three reference receivers, train supervision by a control centre."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def ground() -> None:
     """Monitor satellite positioning from the ground, and supervise trains.
 
     A reference triangle of three receivers detects satellite faults, disturbances and failed receivers. A control
-    centre supervises trains over two encrypted links, sends a movement authority to each train, and sets points.
+    centre supervises trains over two encrypted links, sends a movement authority to each train, and moves points.
     """
 
 
@@ -83,7 +83,7 @@ def monitor(
 
     Example: `railfix ground monitor a.rnx b.rnx c.rnx --nav day.nav --out monitor`
 
-    With --fixes the logs contain positions that another program or service has computed, such as CLAS.
+    With --fixes the logs contain positions computed by another program, or by a service such as CLAS.
 
     Example: `railfix ground monitor --fixes a.pos b.pos c.pos --point ... --point ... --point ... --out monitor`
 
@@ -104,9 +104,9 @@ def monitor(
     if len(choices.point) not in (0, 3):
         raise SettingsError(f"--point was given {len(choices.point)} times; give it once for each receiver")
     if choices.live and choices.fixes:
-        raise SettingsError("--live evaluates observation streams; --fixes is for logs of positions")
+        raise SettingsError("--fixes is for logs of positions, and cannot be combined with --live")
     if choices.live and not choices.point:
-        raise SettingsError("--point is missing: streams contain no known points; give it once for each receiver")
+        raise SettingsError("--point is missing: streams contain no known coordinates; give it once for each receiver")
     try:
         _monitor(logs, choices, limits=limits, times=times)
     except OSError as error:
@@ -114,7 +114,7 @@ def monitor(
 
 
 def _monitor(logs: list[str], choices: MonitorChoices, *, limits: TriangleLimits, times: MonitorLimits) -> None:
-    """Monitor logs, or streams for at most `for_s`; write one row per epoch to monitor.csv, and print each order."""
+    """Monitor logs or (for at most `for_s`) streams; write one row per epoch to monitor.csv, and print each order."""
     import asyncio
     import time
 
@@ -187,7 +187,7 @@ async def _fixes(logs: list[str], choices: MonitorChoices) -> AsyncIterator[Stat
 
 
 class KeyChoices(Settings):
-    """Numbers of the trains for which keys are made, and period of validity of the certificates."""
+    """Identification numbers of the trains for which keys are made, and period of validity of the certificates."""
 
     train: tuple[int, ...] = option("Number of a train, from 1; may be repeated.", metavar="N")
     days: int = option("Validity of the certificates.", 365, metavar="DAYS", ge=1, le=36_500)
@@ -205,7 +205,7 @@ def keys(
     choices: KeyChoices,
     *,
     out: Annotated[
-        Path, typer.Argument(metavar="DIR", help="Empty folder for the keys; it is created if it does not exist.")
+        Path, typer.Argument(metavar="DIR", help="Folder for the keys: new, empty, or with a certificate authority.")
     ],
 ) -> None:
     """Make keys and certificates for a control centre and trains, add trains, and renew certificates.
@@ -234,18 +234,18 @@ def keys(
         if path.suffix == ".pem":
             certificate = load_pem_x509_certificate(path.read_bytes())
             ends = certificate.not_valid_after_utc.date().isoformat()
-            console.print(f"{path.name}: serial number {certificate.serial_number:#x}, ends on {ends}")
+            console.print(f"{path.name}: serial number {certificate.serial_number:#x}, expires on {ends}")
 
 
 class DemoChoices(Settings):
-    """Options of the demonstration of the ground side."""
+    """Options of `railfix ground demo`."""
 
     seed: int = option("Seed of the random losses and noise.", 1, metavar="N", ge=0)
     speed: float = option("Ratio of simulated time to real time.", 6.0, metavar="X", ge=1, le=50)
     port: int = option("Port of the page; 0 for any free port.", 0, metavar="PORT", ge=0, le=65535)
-    hold: float = option("Time for which the page stays available after the end.", 0.0, metavar="S", ge=0, le=3600)
+    hold: float = option("Time for which the page stays open after the demonstration.", 0.0, metavar="S", ge=0, le=3600)
     coverage: Path | None = option(
-        "Picture with the response rates of the links along the line, and the round-trip times over time and chainage.",
+        "Plots of the response rates of the links along the line, and of round-trip times over time and over chainage.",
         None,
         metavar="PNG",
     )
@@ -257,10 +257,10 @@ class DemoChoices(Settings):
 def demo(choices: DemoChoices) -> None:
     """Demonstrate a control centre, two trains with two lossy links each, and a satellite fault.
 
-    The trains meet in a passing loop. One bearer of the links fails, and later both bearers of one train. At the end, a
-    satellite clock drifts; the reference triangle detects the drift, satellite positioning is suspended, and the trains
-    stop. The centre's page shows the trains. All traffic stays on loopback addresses. The program ends after about half
-    a minute with a table of events.
+    The trains meet in a passing loop. One bearer fails for both trains; later, both bearers of one train fail. At the
+    end, a satellite clock drifts; the reference triangle detects the drift, satellite positioning is suspended, and the
+    trains stop. The centre's page shows the trains. All traffic stays on loopback addresses. The program ends after
+    about half a minute with a table of events.
 
     Example: `railfix ground demo --hold 60`
 
@@ -303,15 +303,15 @@ class CentreChoices(Settings):
 
     page: str = option("Address of the page; port 0 for any free port.", "127.0.0.1:8000", metavar="HOST:PORT")
     password: Path | None = option(
-        "File with the password for orders in the first line, and the NAME and PASSWORD of one person in each "
-        "further line. Without this file, a password is generated and printed.",
+        "File whose first line is the password for giving orders; each further line has the NAME and PASSWORD of one "
+        "person. Without this file, a password is generated and printed.",
         None,
         metavar="FILE",
     )
     orders: str | None = option(
         "Separate address that accepts orders; the address of --page then accepts none.", None, metavar="HOST:PORT"
     )
-    for_s: float | None = option("End after this time; by default on a signal.", None, name="--for", metavar="S", ge=0)
+    for_s: float | None = option("End after this time (by default at a signal).", None, name="--for", metavar="S", ge=0)
 
 
 @app.command("centre", cls=Command)
@@ -321,7 +321,7 @@ def centre(
     *,
     path: Annotated[Path, typer.Argument(metavar="CENTRE.toml", help="File with line, trains, keys and addresses.")],
 ) -> None:
-    r"""Supervise the trains of a line: receive reports, send movement authorities, set points and routes, show a page.
+    r"""Supervise the trains of a line: receive reports, send authorities, move points, set routes, show a page.
 
     Trains connect over two QUIC links with the certificates of `railfix ground keys`. Position reports are written into
     a database before they are acknowledged, and movement authorities before they are sent. Therefore, the centre may be
@@ -403,8 +403,8 @@ def train(
 
     Example: `railfix live ... | railfix ground train 1 --keys keys --centre 10.0.1.1:4433 --centre 10.0.2.1:4433`
 
-    Exit codes are listed in `railfix --help`; the code is also 0 if no authority was received, which is reported on
-    standard error.
+    Exit codes are listed in `railfix --help`; if no authority was received, this is reported on standard error, and the
+    code is 0.
     """
     import asyncio
 

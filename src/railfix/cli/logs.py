@@ -75,7 +75,7 @@ def which_track(
     choices: Annotated[Choices, Without("screens", "without", "filter", "cn0_curve", "error_model", "sbas")],
     *,
     out: Annotated[
-        Path | None, typer.Option(metavar="PICTURE", help="Picture of the probabilities over time (.png or .svg).")
+        Path | None, typer.Option(metavar="PICTURE", help="Plot of the probabilities over time (.png or .svg).")
     ] = None,
     save_last: Annotated[
         Path | None,
@@ -87,12 +87,12 @@ def which_track(
     ] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Decide on which track a train at rest is, or report `undecided`.
+    """Determine the track on which a train stands, or report `undecided`.
 
     Each track of the map within 60 m is a hypothesis; a further hypothesis is that the track is missing from the map
-    (`none`). At rest, the code errors of a satellite are nearly constant, so longer observation helps less than
-    independent samples would. With a base station, carrier phases are also used. The train is reported to be on a track
-    when the total probability of all other hypotheses is below `--risk`; the probabilities are always printed.
+    (`none`). At rest, the code errors of a satellite are nearly constant, so averaging over a longer time reduces them
+    little. With a base station, carrier phases are also used. The train is reported to be on a track when the total
+    probability of all other hypotheses is below `--risk`; the probabilities are always printed.
 
     Example: `railfix which-track --front front.obs --rear rear.obs --spacing 18 --nav brdc.nav --map yard.gpkg`
 
@@ -177,15 +177,14 @@ def export(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder that `railfix run` wrote.")],
     *,
     out: Annotated[
-        Path,
-        typer.Option(metavar="FILE", help="File to write; it ends in .kml, .gpx, .geojson, .gpkg, .parquet or .mcap."),
+        Path, typer.Option(metavar="FILE", help="File to write (.kml, .gpx, .geojson, .gpkg, .parquet or .mcap).")
     ],
     filtered: Annotated[
         bool | None,
         typer.Option(
             "--filter/--single",
-            help="Write the positions of the filter along the track, or of single epochs; by default the filter's "
-            "positions if the run has them.",
+            help="Whether to write the positions of the filter (--filter) or of single epochs (--single); by default "
+            "the filter's positions if the run has them.",
         ),
     ] = None,
     overwrite: OverwriteOption = False,
@@ -201,8 +200,8 @@ def export(
 
     Example: `railfix export results --out positions.gpkg`
 
-    Exit codes are listed in `railfix --help`; the code is 4 if a package is not installed, 7 if no epoch has a
-    position.
+    Exit codes are listed in `railfix --help`; the code is 4 if a package that the format needs is not installed, 7 if
+    no epoch has a position.
     """
     tables = list_position_tables(run)
     if filtered and tables and "train" not in tables:
@@ -220,7 +219,7 @@ def export(
     write = write_mcap if out.suffix.lower() == ".mcap" else write_positions
     written = write(round_floats(folder.positions), out, description=description)
     console = TableConsole()
-    console.print(f"{written:,} positions of {len(folder.positions):,} epochs and antennas, {what}")
+    console.print(f"{written:,} of {len(folder.positions):,} possible positions, {what}")
     console.print(f"{frame}, heights above the ellipsoid")
     show_files(console, [path for path in (out, style) if path is not None])
 

@@ -37,7 +37,7 @@ app = command_group(
 
 TracksArgument = Annotated[
     list[Path],
-    typer.Argument(metavar="TRACK...", help="CSV or GeoJSON track maps, joined in this order to one route."),
+    typer.Argument(metavar="TRACK...", help="CSV or GeoJSON track maps, joined in this order into one route."),
 ]
 
 #: Options for reading a map in commands that need neither the frame nor the accuracy of the map.
@@ -53,11 +53,11 @@ def check(
     *,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="Folder for the picture map_check.png; it is created if it does not exist."),
+        typer.Option(metavar="DIR", help="Folder for the plot map_check.png; it is created if it does not exist."),
     ] = None,
     reading: MapReading,
     max_gap: Annotated[
-        float, typer.Option(metavar="M", help="Largest gap between the ends of two segments that is bridged.")
+        float, typer.Option(metavar="M", help="Gaps between the ends of two segments are bridged up to this length.")
     ] = 1.0,
     mid_chord: Annotated[
         float, typer.Option(metavar="M", help="Largest accepted mid-chord deviation from the arc.")
@@ -68,7 +68,7 @@ def check(
 
     The command checks the spacing of points, duplicate points, kinks, jumps and reversals of the kilometrage,
     gradients, height spikes and cant. The mid-chord deviation from the arc is computed with `radius_m` where it is
-    given, otherwise with the circle through neighbouring points. Curve attributes are compared with the points.
+    given, otherwise with the circle through neighbouring points. Curve attributes are compared with the geometry.
 
     Example: `railfix map check line.csv --out report`
 
@@ -100,7 +100,7 @@ def check(
     _print_quality(quality, picture)
     if quality.errors:
         raise MapQualityError(
-            f"{track.name}: the track map has {plural(quality.errors, 'error')}, the first {quality.errors[0].sentence}"
+            f"{track.name}: the track map has {plural(quality.errors, 'error')}; first: {quality.errors[0].sentence}"
         )
 
 
@@ -127,8 +127,8 @@ def features(
 
     A train can determine its position by measuring such a change (`railfix.motion.features`). Changes are computed over
     15 m, which is about the distance between two bogies. With `--run`, the features are the changes that several runs
-    measured consistently. Each feature then has the number of runs that measured it, the standard deviation of the
-    measured positions (as in P2's table 1), and the distance from the same feature in the map.
+    measured consistently. For each feature, the table then states the number of runs that measured it, the standard
+    deviation of the measured positions (as in table 1 of paper P2), and the distance from the same feature in the map.
 
     Example:
 
@@ -202,11 +202,11 @@ def from_positions_command(
         str | None,
         typer.Option(
             metavar="Q,Q...",
-            help="Accepted quality numbers (RTKLIB: 1 fix, 2 float, 5 single); by default 1 if the log has any.",
+            help="Accepted quality numbers (RTKLIB: 1 fix, 2 float, 5 single); by default 1 (all if none is logged).",
         ),
     ] = None,
     max_sigma: Annotated[
-        float | None, typer.Option(metavar="M", help="Largest standard deviation of a position on any axis.")
+        float | None, typer.Option(metavar="M", help="Positions with a larger sigma on any axis are omitted.")
     ] = None,
     columns: ColumnNames,
     name: Annotated[
@@ -271,7 +271,7 @@ def _print_quality(quality: TrackQuality, picture: Path | None) -> None:
     if needed < spacing.max():
         console.print(
             f"with points every {needed:.1f} m, the chords of the sharpest curve would be within 1 cm of the arc; the "
-            "antenna's path follows the arc between the points"
+            "points are less dense, but railfix follows the arc between them"
         )
     show_notes(console, track.provenance.notes)
     rows = []

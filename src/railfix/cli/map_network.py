@@ -30,7 +30,7 @@ from railfix.track.read import track_of_segments
 
 Maps = Annotated[list[Path], typer.Argument(metavar="MAP...", help="Map files; all their tracks form the network.")]
 
-#: Names of the options for reading a track that only `railfix run` has.
+#: Names of those options for reading a track that only `railfix run` has.
 RUN_ALONE = ("reference", "cache")
 #: Options for reading a map in a command that processes no run.
 MapReading = Annotated[TrackReading, Without(*RUN_ALONE, "map_epoch", "plate", "jgd_parameters", "height_sigma")]
@@ -40,7 +40,7 @@ class RouteChoice(Settings):
     """Selection of a route through a network: by the names of tracks, by points, or by positions of a run."""
 
     tracks: str | None = option(
-        "Names of tracks of the route, in order; tracks between two of them are added.", None, metavar="NAME,NAME..."
+        "Names of tracks of the route, in order; tracks in between are added.", None, metavar="NAME,NAME..."
     )
     via: tuple[str, ...] = option(
         "Point on the route; repeat the option in the order of travel.", (), metavar="LAT,LON"
@@ -71,7 +71,7 @@ class Connecting(Settings):
         gt=0.0,
     )
     same_frame: Literal["no", "yes"] = option(
-        "The positions are in the frame of the map (RTK from its base stations), not in the frame of the satellites.",
+        "The positions are in the frame of the map (as RTK positions are), not in the frame of the satellite orbits.",
         "no",
         name="--same-frame",
     )
@@ -88,18 +88,18 @@ class MatchOptions(Settings):
         gt=0.0,
     )
     within: float | None = option(
-        "Largest distance of a position from a track; by default 30 m, or up to 100 m if LOG states larger sigmas.",
+        "Positions farther from all tracks are not matched; by default 30 m, or up to 100 m for large sigmas in LOG.",
         None,
         metavar="M",
         gt=0.0,
     )
     fill: Rows = option(
         "Rows that are filled along the shortest route. gaps: rows without a position between known positions; "
-        "off-map: also rows whose positions are off the map, as in a tunnel, including rows at the start and end "
-        "of LOG.",
+        "off-map: also rows whose positions are too far from every track (for example in a tunnel), including rows "
+        "at the start and end of LOG.",
         "gaps",
     )
-    picture: Path | None = option("Picture to write (.png or .svg).", None, metavar="FILE")
+    picture: Path | None = option("Plot of network and positions (.png or .svg).", None, metavar="FILE")
     page: Path | None = option("Page to write: zoomable plan, switches, faults, tables.", None, metavar="FILE.html")
 
 
@@ -118,14 +118,14 @@ def network(
     *,
     reading: MapReading,
     connecting: Annotated[Connecting, Without("same_frame")],
-    out: Annotated[Path | None, typer.Option(metavar="PICTURE", help="Picture to write (.png or .svg).")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="PICTURE", help="Plot of the network (.png or .svg).")] = None,
     page: Page = None,
     overwrite: OverwriteOption = False,
 ) -> None:
     """Check a network of tracks and print its faults.
 
     The command reports gaps between ends of tracks, connections whose ends do not meet, dead ends, kinks at switches,
-    and tracks that are closer together than vehicles require.
+    and tracks that are too close together for vehicles to pass.
 
     Example: `railfix map network tracks.gpkg --out network.png`
 
@@ -257,12 +257,12 @@ def match_command(
 ) -> None:
     """Match positions to the tracks of a network.
 
-    The output has, for each position, the track, the chainage on it, its probability, and the second most probable
-    track.
+    For each position, the output has the most probable track, the probability of this track, the chainage on it, and
+    the second most probable track.
 
-    Rows without a position that lie between known positions are filled along the shortest route; `filled_bound_m`
-    bounds the error of a filled row. The positions are transformed to the reference frame of the map at the epoch of
-    the positions. For a position far from all tracks, the track is empty.
+    Rows that have no position but are between rows with known positions are filled along the shortest route;
+    `filled_bound_m` bounds the error of a filled row. The positions are transformed to the reference frame of the map
+    at the epoch of the positions. For a position far from all tracks, the column `track` is empty.
 
     Example: `railfix map match net.gpkg --log run.pos --out matched.csv`
 

@@ -1,4 +1,4 @@
-"""``railfix map service`` and ``railfix map survey``: satellite service by chainage, and a map from several runs."""
+"""``railfix map service`` and ``railfix map survey``: positioning quality by chainage, and a map from several runs."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def service(
     out: Annotated[
         Path | None, typer.Option(metavar="FILE.csv", help="Table to write, with one row per stretch.")
     ] = None,
-    picture: Annotated[Path | None, typer.Option(metavar="FILE", help="Picture to write (.png or .svg).")] = None,
+    picture: Annotated[Path | None, typer.Option(metavar="FILE", help="Plot of the table (.png or .svg).")] = None,
     page: Annotated[Path | None, typer.Option(metavar="FILE.html", help="Page to write, with zoomable charts.")] = None,
     stretch: Annotated[float, typer.Option(metavar="M", help="Length of the stretches of the line.")] = 100.0,
     limit: Annotated[float, typer.Option(metavar="M", help="Alarm limit for the protection level.")] = 20.0,
@@ -76,20 +76,20 @@ def service(
     served = found.filter(pl.col("within_limit_share") >= _SERVED)
     worst = found.sort("within_limit_share", "tracking_share", "ok_share", nulls_last=True).row(0, named=True)
     console = TableConsole()
-    verdict = [f"{len(found)} stretches of {stretch:g} m with epochs of {plural(runs, 'run')}"]
+    verdict = [f"{len(found)} stretches of {stretch:g} m contain epochs of the {plural(runs, 'run')}"]
     if worst["within_limit_share"] is not None:
         verdict.append(
-            f"{len(served)} of them have a protection level within {limit:g} m in {100 * _SERVED:.0f} % of the epochs "
-            f"or more; worst stretch {worst['from_m']:.0f} to {worst['to_m']:.0f} m "
+            f"in {len(served)} of them, at least {100 * _SERVED:.0f} % of the epochs have a protection level within "
+            f"{limit:g} m; worst stretch {worst['from_m']:.0f} to {worst['to_m']:.0f} m "
             f"({100 * worst['within_limit_share']:.0f} % of its epochs)"
         )
     else:
-        verdict.append("the runs have no filter and no protection levels; the fractions are of single epochs")
+        verdict.append("the runs have no filter and no protection levels; fractions refer to single-epoch positions")
     show_verdict(console, verdict)
     caption = (
-        f"Stretches of {stretch:g} m from the stated chainage. Satellites and protection levels: median and percentile "
-        "of the epochs. 3-D: distance of the 3-D position from the line. Filter: fraction of epochs with a protection "
-        "level. Served: fraction of epochs with a protection level within the limit"
+        f"Stretches of {stretch:g} m by first chainage. Satellites and protection levels (level): median and a "
+        "percentile over the epochs. 3-D: distance of the 3-D position from the line. Filter: fraction of epochs "
+        "with a protection level. Served: fraction of epochs with a protection level within the limit"
     )
     table = listing("service", found, _COLUMNS, caption)
     show_table(console, table)
@@ -110,7 +110,7 @@ class SurveyFiles(Settings):
         "Navigation file of the logs; repeat the option for several days.", (), metavar="NAV", panel=INPUTS
     )
     picture: Path | None = option(
-        "Picture of the map, the runs and the standard deviations (.png or .svg).", None, metavar="FILE"
+        "Plot of the map, the runs and the standard deviations (.png or .svg).", None, metavar="FILE"
     )
     name: str | None = option("Name of the track; by default the name of the file.", None, metavar="NAME")
 

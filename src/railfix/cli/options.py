@@ -224,11 +224,11 @@ def _built(model: type[Model], options: list[_Option], given: Mapping[str, Any])
 
 
 class Choices(Settings):
-    """Settings of a run from the command line; in the order of the fields, later options override earlier ones."""
+    """Settings of a run from the command line. Each field overrides the fields that are declared before it."""
 
     preset: str | None = option(
         "Base preset, which other settings override: default, strict (fewer positions of higher integrity), or p1 "
-        "(limits of paper P1, which describes the screens, for geodetic receivers at 10 Hz).",
+        "(limits for geodetic receivers at 10 Hz, from paper P1, which describes the screens).",
         None,
         metavar="NAME",
     )
@@ -248,10 +248,10 @@ class Choices(Settings):
     )
     without: tuple[str, ...] = option("Switch one screen off; may be repeated.", (), metavar="NAME")
     filter: Literal["track", "off"] | None = option(
-        "Filter along the track over all epochs, written to train.csv and train.parquet: track (default) or off.", None
+        "Run the filter along the track over all epochs (train.csv, train.parquet): track (default) or off.", None
     )
     cn0_curve: Path | None = option(
-        "File written by `railfix cn0-curve`: mean C/N0 over elevation of the antenna and receiver.",
+        "File written by `railfix cn0-curve`: mean C/N0 of antenna and receiver by satellite elevation.",
         None,
         metavar="TOML",
     )
@@ -261,8 +261,8 @@ class Choices(Settings):
         metavar="TOML",
     )
     sbas: tuple[Path, ...] = option(
-        "Log of SBAS messages (RTKLIB .sbs, EMS, RINEX 2 B, UBX, SBF), or the word stream for the "
-        "messages in the receivers' own logs and streams. Ranges are then corrected as DO-229D requires, and "
+        "Log of SBAS messages (RTKLIB .sbs, EMS, RINEX 2 B, UBX, SBF), or the word `stream`, to use the messages in "
+        "the receivers' own logs and streams. With this option, ranges are corrected as DO-229D requires, and "
         "satellites without a valid correction are rejected.",
         (),
         metavar="FILE",
@@ -317,7 +317,7 @@ def _screens(option: str, text: str) -> list[str]:
 
 
 def check_set_once(settings: tuple[str, ...]) -> None:
-    """Raise SettingsError if two of the texts KEY=VALUE have the same key."""
+    """Raise SettingsError if two KEY=VALUE texts have the same key."""
     keys = [text.partition("=")[0].strip() for text in settings]
     if repeated := [key for key in keys if keys.count(key) > 1]:
         raise SettingsError(f"--set {repeated[0]} is given {keys.count(repeated[0])} times; give it once")
@@ -326,7 +326,7 @@ def check_set_once(settings: tuple[str, ...]) -> None:
 def set_value(values: dict[str, Any], text: str) -> None:
     """Insert one KEY=VALUE into nested settings; a value that is not valid TOML is kept as text.
 
-    Raise SettingsError if the text has no key or no equals sign, or if a group in the key is already a single setting.
+    Raise SettingsError if the text has no key or no equals sign, or if the key uses a single setting as a group.
     """
     key, equals, value = text.partition("=")
     if not equals or not key.strip():

@@ -29,7 +29,7 @@ _SATELLITES: Final[Sequence[Column]] = (
     ("residual m", "residual_m", partial(digits, 2)), ("without it m", "without_shift_m", partial(digits, 2)),
     ("sigma then m", "without_sigma_m", partial(digits, 2)), ("outcome", "reason_text", str),
 )  # fmt: skip
-#: Parameter ``M_MMAP_THRESHOLD`` of ``malloc.h``, and its value: larger arrays [bytes] are mapped separately.
+#: Number of ``M_MMAP_THRESHOLD`` in ``malloc.h``, and its value: arrays of more bytes are mapped separately.
 _THRESHOLD: Final = (-3, 1 << 17)
 
 
@@ -50,8 +50,8 @@ def report(
         list[Path] | None,
         typer.Option(
             metavar="RUN",
-            help="Another run on the same log, whose conventional positions are shown. A run with `--screens "
-            "elevation` has unscreened positions, as in P1. Repeat the option with one for each run in order.",
+            help="Another run on the same log; its conventional positions are shown. A run with `--screens elevation` "
+            "has unscreened positions, as in paper P1. Repeat the option for each run in order.",
         ),
     ] = None,
     background: Annotated[
@@ -86,7 +86,7 @@ def report(
     ]
     _free_arrays_at_once()
     check_outputs((out, "page"), overwrite=overwrite, inputs=[*(reference or ()), *in_runs, background])
-    # the observations are read in pieces while the page is written, so that errors of reading are raised in this block
+    # the observations are read in pieces while the page is written, so that read errors are raised in this block
     with reading_table(runs[0] / "observations.parquet" if len(runs) == 1 else Path("observations.parquet of a RUN")):
         page = write_report(
             runs,
@@ -119,7 +119,7 @@ def explain(
     html: Annotated[Path | None, typer.Option(metavar="HTML", help="Page to write, which also has a sky plot.")] = None,
     overwrite: OverwriteOption = False,
 ) -> None:
-    """Explain an epoch: position, use of every satellite, parts of sigma and protection level, reason for the status.
+    """Explain an epoch: position, use of every satellite, terms of sigma and protection level, reason for the status.
 
     For each used satellite, the table has the distance by which the single-epoch position would move along the line if
     this satellite were omitted. The epoch nearest to TIME is explained; it may be at most one minute away.
@@ -145,7 +145,7 @@ def plot_screens(
     run: Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `railfix run --observations` wrote.")],
     *,
     out: Annotated[
-        Path, typer.Option("--out", metavar="PICS", help="Folder for the pictures; it is created if it does not exist.")
+        Path, typer.Option("--out", metavar="PICS", help="Folder for the plots; it is created if it does not exist.")
     ],
     overwrite: OverwriteOption = False,
 ) -> None:

@@ -1,6 +1,4 @@
-"""``railfix run`` positions logs and writes the results into a folder; ``railfix live`` positions streams as they
-arrive.
-"""
+"""``railfix run`` computes positions from logs; ``railfix live`` computes positions from streams as they arrive."""
 
 from __future__ import annotations
 
@@ -92,25 +90,25 @@ def live(
             "--live",
             metavar="KEY=VALUE",
             rich_help_panel="Choices",
-            help="Setting of live operation, such as period_s=0.1, or one of pair_wait_s, reconnect, train, line, "
-            "facing, front_offset_m and length_m; may be repeated.",
+            help="Setting of live operation, such as period_s=0.1; may be repeated. Further keys are pair_wait_s, "
+            "reconnect, train, line, facing, front_offset_m and length_m.",
         ),
     ] = None,
 ) -> None:
-    r"""Position a train from the streams of its receivers, and send one message per period.
+    r"""Compute the positions of a train from the streams of its receivers, and send one message per period.
 
     Streams are UBX, SBF or RTCM 3 with observations, ephemerides and other messages. Ephemerides are used as soon as
     they are complete. SBAS messages are used only with `--sbas stream`. The positions equal those that `railfix run`
     computes from the same epochs and sensor data. A message is sent even for a period without input. Broken connections
-    are reopened. The program ends when the input files end, or on SIGINT or SIGTERM. On SIGHUP, it only prints a
-    message.
+    are reopened. The program ends on SIGINT or SIGTERM, or when the inputs of all antennas have ended. On SIGHUP, it
+    only prints a message.
 
     Example:
 
         railfix live --front tcp://127.0.0.1:3001 --rear tcp://127.0.0.1:3002 --track line.csv \
             --vehicle car.toml --send json@- --send cbor@udp://127.0.0.1:4000
 
-    Exit codes are listed in `railfix --help`; the code is 9 if two channels disagree, 143 after SIGTERM.
+    Exit codes are listed in `railfix --help`; the code is 9 if the two processing channels disagree, 143 after SIGTERM.
     """
     import asyncio
 

@@ -33,7 +33,7 @@ class SimulateOptions(Settings):
         metavar="KEY=VALUE",
     )
     only: tuple[str, ...] = option(
-        "Simulate only this run of a recipe, by its number from 1 or its name; may be repeated.", (), metavar="RUN"
+        "Simulate only this run of a recipe, given by its number (from 1) or name; may be repeated.", (), metavar="RUN"
     )
     packing: Literal["packed", "plain"] = option("Write uncompressed files: .rnx, .csv.", "packed", name="--plain")
     overwrite: Overwrite = option("Replace existing results.", "refuse", name="--overwrite")

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 Instance = TypeVar("Instance")
 Rows = TypeVar("Rows", bound="DataclassInstance")
-Floats = NDArray[np.float64]  #: Real numbers in the unit at the end of the array's name; NaN where absent.
+Floats = NDArray[np.float64]  #: Real numbers, NaN where absent; the array's name ends with the unit.
 Complexes = NDArray[np.complex128]  #: Complex numbers.
 Integers = NDArray[np.int64]  #: Counts and identifiers.
 Indices = NDArray[np.intp]  #: Indices into another array.
@@ -60,12 +60,12 @@ def freeze_arrays(instance: DataclassInstance) -> None:
 def freeze_rows(instance: DataclassInstance, of: str, first: str = "time") -> None:
     """Freeze the arrays of a dataclass; raise ValueError if an array differs from the array `first` in length.
 
-    `of` names the rows in the error message.
+    `of` is the noun for the rows in the error message, such as "epochs".
     """
     rows = len(vars(instance)[first])
     for name, value in vars(instance).items():
         if isinstance(value, np.ndarray) and len(value) != rows:
-            raise ValueError(f"{name} has {len(value)} {of}, {first} has {rows}")
+            raise ValueError(f"{name} has {len(value)} {of}, but {first} has {rows}")
     freeze_arrays(instance)
 
 
@@ -92,8 +92,8 @@ def take_rows(instance: Rows, rows: NDArray[Any] | slice) -> Rows:
 def join_rows(parts: Sequence[Rows]) -> Rows:
     """Return a dataclass with the concatenated rows of several dataclasses of one type.
 
-    Fields that are not arrays are taken from the first dataclass. Raise ValueError if the dataclasses differ in which
-    fields are arrays.
+    Fields that are not arrays are taken from the first dataclass. Raise ValueError if the dataclasses do not have the
+    same array fields.
     """
     if len(parts) == 1:
         return parts[0]
@@ -136,8 +136,8 @@ def places_in_groups(counts: NDArray[Any]) -> tuple[Indices, Indices]:
 def channel_sums(values: Floats) -> Floats:
     """Return the sums over the channels (axis 1), with the terms added in the order of the channels.
 
-    Channels of zeros therefore do not change the rounding of a sum. The sum of an epoch is the same in a chunk with the
-    channels of this epoch only and in a chunk with all channels of the log.
+    Channels with the value 0 therefore do not change the rounding of a sum. The sum of an epoch is the same in a chunk
+    with the channels of this epoch only and in a chunk with all channels of the log.
     """
     return np.asarray(np.cumsum(values, axis=1)[:, -1]) if values.shape[1] else values.sum(axis=1)
 

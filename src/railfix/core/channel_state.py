@@ -24,7 +24,7 @@ class JoinedChannels:
     """Channels of a chunk, followed by the channels that occur only in states; U in total."""
 
     channel: Strings  #: Names of the channels, shape (U,).
-    present: int  #: Number of channels of the chunk, which come first in `channel`.
+    present: int  #: Number of channels of the chunk; they come first in `channel`.
     #: For each state, the index of each channel in that state, shape (U,); -1 if the state lacks the channel.
     places: tuple[Indices, ...]
 
@@ -48,8 +48,8 @@ class JoinedChannels:
 def join_channels(channel: Strings, states: Sequence[Strings], kept: Sequence[Masks | None] = ()) -> JoinedChannels:
     """Return the union of the channels of a chunk and of states.
 
-    `kept` has, for each state, a mask of the channels that are recent enough; None or a missing mask keeps all
-    channels.
+    `kept` has, for each state, a mask of the channels that are recent enough. A state whose mask is None or not given
+    keeps all channels.
     """
     names = channel.tolist()
     place = {name: k for k, name in enumerate(names)}

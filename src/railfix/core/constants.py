@@ -48,18 +48,19 @@ CLOCK_GROUP: Final[dict[str, str]] = {"G": "G", "J": "G", "E": "E", "C": "C", "R
 # Constants that kernels and their callers share.
 #: Gradient of the Earth-rotation term of a range with respect to the receiver's position, rounded up (see `geodesy`).
 ROTATION_GRADIENT: Final = 1.1e-5
-#: Number of parts into which each step of the section search divides a stretch of line.
+#: Each step of the section search divides a stretch of the line into this number of parts.
 FAN_OUT: Final = 8
-#: Smallest redundancy number of a range whose error can be estimated.
+#: The error of a range is estimated only if the redundancy number of the range is at least this value.
 LEAST_REDUNDANCY: Final = 1e-9
-#: Cosine of the largest angle between the line and its tangent (6 deg) for the linear model of the protection level.
+#: Cosine of 6 deg: largest angle, seen from the position, between the tangent and a point of the line to which the
+#: linear model of the protection level applies.
 ALONG: Final = 0.9945
-#: Upper limit of the distance within which the section search approximates the line by its tangent [m].
+#: The section search approximates the line by its tangent within this distance, or less if the line bends earlier [m].
 CLEAR_M: Final = 200.0
-#: Largest distance from a tangent at which a point counts as lying on the tangent [m].
+#: A point counts as lying on a tangent if its distance from the tangent is at most this value [m].
 ON_TANGENT_M: Final = 1e-3
 
-#: Prior probability of a joint fault of the low satellites on one side of the track. The value is the upper bound with
-#: 95 % confidence from the largest data set: faults in 2 of 30 943 blocks of 30 s, from 70 simulated hours in a city
+#: Prior probability of a joint fault of the low satellites on one side of the track: upper 95 % confidence bound of the
+#: fraction of time in 70 simulated hours in a city, with faults in a part of 2 of 30 943 blocks of 30 s
 #: (docs/level-results.md). Real recordings are shorter, and support only an upper bound of 1e-2.
 SUPPORTED_SIDE_PRIOR: Final = 1.3e-5

@@ -12,7 +12,7 @@ import numpy as np
 from railfix.core.arrays import Indices
 
 Value = TypeVar("Value")
-#: Names of the fields that have no rows because they depend only on the channels.
+#: Names of the fields that have no row per epoch, because they depend only on the channels.
 _OF_CHANNELS: Final = frozenset({"satellite", "signal", "frequency_hz", "channels", "columns", "header"})
 EVERY: Final = slice(None)  #: Slice of all rows.
 

@@ -1,22 +1,22 @@
-"""The errors that railfix raises, and the exit code of the command line for each.
+"""The errors that railfix raises, and the exit code of the program for each.
 
 Every message is one sentence that names the file (and line or field), the expected content, and the remedy.
 Array functions raise `ValueError` when an argument violates their contract.
 
-==== =====================================================================
+==== ===============================================================================================================
 code meaning
-==== =====================================================================
+==== ===============================================================================================================
 0    done
 1    an internal error of railfix (a traceback is shown)
 2    the command line is wrong (unknown option, missing argument)
 3    an input file is missing, unreadable, or malformed
 4    a setting is misspelt, out of range, or contradicts another setting
-5    the inputs are readable but do not match each other, for example in day or location
+5    the inputs are readable but do not match each other, for example because they are from different days or places
 6    the track map was checked and has errors
-7    the results contain no position, or the inputs no usable position
+7    the results contain no position, or the inputs contain no usable position
 8    the output cannot be written
-9    two channels of a live session computed different outputs from the same input
-==== =====================================================================
+9    the two processing channels of a live session computed different outputs from the same input
+==== ===============================================================================================================
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from typing import ClassVar, Final
 class RailfixError(Exception):
     """Base of all errors that a user can correct, in input files, settings or outputs."""
 
-    exit_code: ClassVar[int] = 1  #: Exit code of the command line for this class of error.
+    exit_code: ClassVar[int] = 1  #: Exit code of the program after an error of this class.
 
 
 class RailfixWarning(UserWarning):
@@ -66,7 +66,7 @@ class SettingsError(RailfixError):
     exit_code = 4
 
 
-#: Names of types, and of the functions that return objects of these types.
+#: For each type, the function that returns an object of this type.
 _MAKERS: Final = {
     "Track": "read_track",
     "Trajectory": "antenna_trajectory",
@@ -88,7 +88,7 @@ def check_type(value: object, expected: type, what: str) -> None:
 
 
 class MismatchError(RailfixError):
-    """Inputs are readable but do not match each other, for example in day or location."""
+    """Inputs are readable but do not match each other, for example because they are from different days or places."""
 
     exit_code = 5
 
@@ -112,6 +112,6 @@ class OutputError(RailfixError):
 
 
 class ChannelsDisagreeError(RailfixError):
-    """Two channels of a live session computed different outputs from the same input."""
+    """The two processing channels of a live session computed different outputs from the same input."""
 
     exit_code = 9

@@ -36,19 +36,19 @@ from railfix.core.staged_files import FilePath as FilePath
 Paths = FilePath | Sequence[FilePath]  #: Path of one file, or paths of several files.
 #: Policy of a reader for a malformed line: stop with an error, or skip and count the line.
 BrokenLines = Literal["stop", "count"]
-Reader = Literal["railfix", "georinex"]  #: Package that reads RINEX observation files.
-#: Last clause of the message about a malformed line, with the option that skips these lines.
-LENIENT: Final = "--lenient (broken_lines='count') skips and counts what is broken"
+Reader = Literal["railfix", "georinex"]  #: Package with which RINEX observation files are read.
+#: End of each message about a malformed line; it names the option that skips malformed lines.
+LENIENT: Final = "--lenient (broken_lines='count') skips and counts malformed lines"
 
-#: Name endings of compressed files. The ending before one of these shows the kind of file, as in ``log.csv.gz``.
+#: Name endings of compressed files. The ending before such an ending shows the kind of file, as in ``log.csv.gz``.
 _SUFFIXES: Final = (".gz", ".z", ".bz2", ".xz", ".zst")
 _UTF16: Final = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _HEAD_BYTES: Final = 4096
 _COPY_BYTES: Final = 1 << 20
-#: Largest ratio of decompressed to compressed size of a file that is read as a whole. Text compresses by a factor of 20
-#: to 50; a file with a much larger factor is not text, and could fill the memory.
+#: A file that is read as a whole is rejected if the ratio of its decompressed to its compressed size exceeds this
+#: value. Text compresses by a factor of 20 to 50; with a larger factor, it is not text and could fill the memory.
 _LARGEST_RATIO: Final = 100
-_LARGEST_BYTES: Final = 64_000_000  #: Decompressed size up to which any ratio is accepted [bytes].
+_LARGEST_BYTES: Final = 64_000_000  #: Up to this decompressed size, a file is accepted at any ratio of sizes [bytes].
 
 
 class ByteStream(io.BufferedIOBase):
@@ -137,7 +137,7 @@ def path_names(paths: Paths) -> list[str]:
 def open_stream(path: FilePath, *, content: Literal["text", "bytes"] = "text") -> ByteStream:
     """Open a file as a stream of its decompressed bytes.
 
-    Line ends are as in the file. With "text", UTF-16 is converted to UTF-8 and a byte order mark is removed. Raise
+    Line ends are not converted. With "text", UTF-16 is converted to UTF-8 and a byte order mark is removed. Raise
     InputFileError if the file is missing, a folder, unreadable, empty, an unsupported archive, or, with "text", binary.
     """
     held = ExitStack()
@@ -214,8 +214,7 @@ def read_bytes(path: FilePath) -> bytes:
             content += block
             if len(content) > most:
                 raise InputFileError(
-                    path,
-                    f"unpacks to more than {most / 1e6:,.0f} MB, more than any map or navigation file of this size",
+                    path, f"unpacks to more than {most / 1e6:,.0f} MB, too much for a file of this compressed size"
                 )
     return bytes(content)
 
@@ -278,7 +277,7 @@ def read_json_object(path: FilePath, *, what: str) -> dict[str, Any]:
 
 
 def read_text_lines(path: FilePath) -> list[str]:
-    """Read the lines of a small file without line ends, as Latin-1, so that one byte remains one column."""
+    """Read a small file as Latin-1, so that each byte is one column, and return its lines without line ends."""
     lines = [line.removesuffix("\r") for line in read_bytes(path).decode("latin-1").split("\n")]
     return lines if lines[-1] else lines[:-1]
 

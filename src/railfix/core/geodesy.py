@@ -1,4 +1,4 @@
-"""Conversions between ECEF (WGS 84), geodetic and local east-north-up coordinates; ranges with Earth rotation.
+"""Conversions between ECEF (WGS 84), geodetic and local east-north-up coordinates; ranges corrected for Earth rotation.
 
 Where an input is NaN, the result is NaN.
 """

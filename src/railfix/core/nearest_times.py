@@ -1,4 +1,4 @@
-"""Find nearest times, and resolve times of day or of week to full dates with a reference time."""
+"""Find nearest times, and complete times of day or of week to full dates near a reference time."""
 
 from __future__ import annotations
 

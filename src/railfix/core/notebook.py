@@ -17,7 +17,7 @@ _MAX_CHARACTERS: Final = 100
 class NotebookTable:
     """Base of dataclasses that notebooks show as a table with the `repr` as caption and one row per field.
 
-    The `repr` defined here, for dataclasses with ``repr=False``, lists the fields and the shapes of arrays.
+    Dataclasses with ``repr=False`` have the `repr` defined here, which lists the fields and the shapes of arrays.
     """
 
     def __repr__(self) -> str:

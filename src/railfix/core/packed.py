@@ -58,7 +58,7 @@ def zip_member(path: FilePath, archive: zipfile.ZipFile) -> str:
 
 COMPRESS: Final = b"\x1f\x9d"  #: First bytes of a compress (.Z) file.
 ZIP: Final = b"PK\x03\x04"  #: First bytes of a zip archive.
-#: First bytes of files that are read as streams, with the function that opens them.
+#: First bytes of compressed files that are read as streams, with the function that opens such a file.
 STREAMS: Final[dict[bytes, Callable[[IO[bytes]], Any]]] = {
     b"\x1f\x8b": lambda source: gzip.GzipFile(fileobj=source, mode="rb"),
     b"BZh": bz2.BZ2File,

@@ -1,4 +1,4 @@
-"""Names of rejection reasons, and registration of the reasons of additional screens."""
+"""Names of rejection reasons, and registration of the reasons of user-defined screens."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from numpy.typing import ArrayLike
 from railfix.core.arrays import Integers
 from railfix.core.reasons import Reason
 
-_ADDED: dict[str, Reason] = {}  #: Reasons of screens added to the package, by lower-case name.
+_ADDED: dict[str, Reason] = {}  #: Reasons of user-defined screens, by lower-case name.
 
-#: First bit that no reason of railfix uses.
+#: Lowest bit that no reason of `Reason` uses.
 _FIRST_FREE_BIT: Final = 23
-#: Last bit that the 32-bit column of the tables can store.
+#: Highest bit that the column of reasons (32-bit integers) can store.
 _LAST_BIT: Final = 30
 
 
@@ -28,7 +28,7 @@ def screen_reason(name: str) -> Reason:
     if name not in _ADDED:
         bit = _FIRST_FREE_BIT + len(_ADDED)
         if bit > _LAST_BIT:
-            raise ValueError(f"no bit is left for the reason {name}: {_LAST_BIT - _FIRST_FREE_BIT + 1} can be added")
+            raise ValueError(f"no bit is left for the reason {name}: all {_LAST_BIT - _FIRST_FREE_BIT + 1} are in use")
         _ADDED[name] = Reason(1 << bit)
     return _ADDED[name]
 

@@ -1,7 +1,7 @@
 """Rejection reasons of observations and solution statuses of epochs.
 
-Each reason is one bit. An observation has the bits of all reasons that apply, or 0 if it was used. Each epoch of an
-antenna has exactly one status.
+Each reason is one bit. An observation has the bits of all reasons that apply, or 0 if it was used. For each antenna,
+every epoch has exactly one status.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class Reason(IntFlag):
     UNHEALTHY = 1 << 6
     #: The satellite is below the elevation mask.
     ELEVATION_MASK = 1 << 7
-    #: The satellite is the only usable one of its clock group, so that its range determines only the group's clock.
+    #: No other satellite of the clock group is usable, so that the range determines only the group's clock.
     ALONE_ON_ITS_CLOCK = 1 << 8
     #: No group delay of the signal is broadcast, or the range has no finite sigma (for example at the horizon).
     NO_CORRECTION = 1 << 9
@@ -45,7 +45,7 @@ class Reason(IntFlag):
     SBAS_DO_NOT_USE = 1 << 13
     #: SBAS: there is no ionospheric delay at the pierce point, or, for SBAS on L5, no code on the second frequency.
     SBAS_NO_IONOSPHERE = 1 << 14
-    #: The C/N0 is below the absolute limit.
+    #: The C/N0 is below the fixed limit for all elevations.
     CN0_FLOOR = 1 << 15
     #: The C/N0 is too far below the open-sky curve at this elevation.
     CN0_CURVE = 1 << 16
@@ -59,8 +59,7 @@ class Reason(IntFlag):
     LASTING_ERROR = 1 << 20
     #: Excluded by the setting `exclude`.
     EXCLUDED_BY_SETTING = 1 << 21
-    #: The range error exceeds 100 m, while the other ranges agree on a position; the filter still uses the channel's
-    #: carrier phase and Doppler.
+    #: The range error exceeds 100 m, while the other ranges agree; the filter still uses carrier phase and Doppler.
     GROSS_ERROR = 1 << 22
 
 
@@ -69,8 +68,8 @@ class Status(IntEnum):
 
     #: A position along the line.
     OK = 0
-    #: A position, but another position on the line fits the ranges equally well, or the probability of a position
-    #: beyond the protection level exceeds the integrity risk.
+    #: A position, but another position on the line fits the ranges equally well, or the probability of an error above
+    #: the protection level exceeds the integrity risk.
     AMBIGUOUS = 1
     #: A position, but it is far beyond an end of the map, or too far from the unconstrained position.
     OFF_MAP = 2
@@ -95,7 +94,7 @@ class Status(IntEnum):
     JAMMING_SUSPECTED = 11
     #: A position, but the signals may be from a spoofer, so that the position error has no bound.
     SPOOFING_SUSPECTED = 12
-    #: A position that was moved to an end of the map, because it was beyond that end by no more than the noise.
+    #: A position that was moved to an end of the map, because it was beyond this end by a distance that noise explains.
     MAP_END = 13
 
     @property

@@ -44,7 +44,7 @@ class Checked(BaseModel):
             except ValidationError as error:
                 raise SettingsError(f"{type(self).__name__}: {first_fault(type(self), error)}") from None
 
-        __init__.__pydantic_base_init__ = True  # pydantic then skips this method when it validates the values of a file
+        __init__.__pydantic_base_init__ = True  # with it, pydantic skips this method for values from a file
 
         def __setattr__(self, name: str, value: Any) -> None:
             raise SettingsError(
@@ -55,7 +55,7 @@ class Checked(BaseModel):
             raise SettingsError(f"{type(self).__name__} cannot be changed; replaced() returns a copy with other values")
 
     def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
-        """Yield the settings that differ from their defaults, which may depend on earlier settings."""
+        """Yield the settings that differ from their defaults; a default may depend on earlier settings."""
         values = {name: getattr(self, name) for name in type(self).model_fields}
         for name, field in type(self).model_fields.items():
             value = values[name]
@@ -64,7 +64,7 @@ class Checked(BaseModel):
 
     def _repr_html_(self) -> str:
         rows = [{"setting": str(name), "value": repr(value)} for name, value in self.__repr_args__()]
-        of = f"{len(rows)} of {len(type(self).model_fields)} settings are not the defaults"
+        of = f"{len(rows)} of {len(type(self).model_fields)} settings differ from their defaults"
         return html_table(rows, caption=f"{type(self).__name__}: {of}")
 
     def replaced(self, **changes: Any) -> Self:
@@ -97,7 +97,7 @@ class Settings(Checked):
 
 
 def is_number(kind: Any) -> bool:
-    """Return whether a type is numeric, or numeric or None; bool does not count as numeric."""
+    """Return whether a type is a number type, or the union of a number type and None; bool is no number type."""
     parts = [get_args(part)[0] if get_origin(part) is Annotated else part for part in (kind, *get_args(kind))]
     return bool not in parts and (int in parts or float in parts)
 

@@ -59,7 +59,7 @@ def read_model_file(model: type[ModelFile], path: FilePath, *, what: str, format
         name = format_name.rsplit(" ", 1)[0]
         if isinstance(written, str) and written.startswith(f"{name} "):
             problem = (
-                f"is {what} of format '{written}', this version reads '{format_name}'; make it again with {command}"
+                f"is {what} of format '{written}', but this version reads '{format_name}'; make it again with {command}"
             )
         else:
             problem = f"is not {what}: format = '{format_name}' was expected; make one with {command}"

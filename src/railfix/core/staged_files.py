@@ -42,11 +42,11 @@ def stage_file(path: FilePath, *, what: str = "file") -> Iterator[Path]:
         raise write_error(target, error, what=f"the {what} ") from error
 
 
-#: Remedy for each error number that means a full file system.
+#: Remedy for each error number of a write that fails because of a size limit.
 _FULL: Final = {
     errno.ENOSPC: "free some space on the disk, or give a folder on another disk",
     errno.EDQUOT: "free some of your quota, or give a folder elsewhere",
-    errno.EFBIG: "give a folder on a file system for larger files",
+    errno.EFBIG: "give a folder on a file system that allows larger files",
 }
 
 

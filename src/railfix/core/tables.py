@@ -68,7 +68,7 @@ class Table:
     numeric: Sequence[int] = ()  #: Indices of the columns with numbers.
     code: Sequence[int] = ()  #: Indices of the columns with code.
     marked: Sequence[int] = ()  #: Indices of the highlighted rows.
-    #: Address of a page about each row, "" for a row without a page; empty if no row has one.
+    #: Address of a page about each row, "" for a row without a page; the sequence is empty if no row has a page.
     links: Sequence[str] = ()
     boxed: bool = False  #: Whether a terminal draws a frame around the table.
 

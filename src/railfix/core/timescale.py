@@ -21,8 +21,8 @@ SECONDS_PER_DAY: Final = 86_400
 _NS: Final = 1_000_000_000
 _NAT: Final = np.iinfo(np.int64).min
 
-#: UTC instants at which GPST - UTC changes: the difference is 0 s after the first instant and increases by 1 s at each
-#: later instant (IERS Bulletin C).
+#: UTC instants at which GPST - UTC changes: the difference is 0 s from the first instant on, and increases by 1 s at
+#: each later instant (IERS Bulletin C).
 LEAP_UTC: Final = np.array(
     [
         "1980-01-06", "1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01", "1988-01-01",

@@ -1,7 +1,7 @@
 """Accuracy and integrity of positions: errors along the line against a reference, and their statistics.
 
 The error is the distance along the map from the reference position's nearest point on the map to the evaluated
-position. It is positive toward the end of the line, for both directions of travel (P1 3.3, 5).
+position. It is positive toward the end of the line, for both directions of travel (paper P1, sections 3.3 and 5).
 """
 
 from railfix.evaluate.accuracy import FIGURE_COLUMNS, WRONG_PLACE_M, Score, score

@@ -39,9 +39,9 @@ from railfix.screens import SCREENS, ScreenSetup
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import TrackStatus
 
-#: Names of three choices: all screens, no screens, and the filter along the track.
+#: Names of the choices with all screens, with no screens, and with the filter along the track.
 ALL, NONE, FILTER = "all", "none", "filter"
-#: Filter sources that require sensor data, each with the inputs of a run that the source needs.
+#: Filter sources that require sensor data, each with the names of the run inputs that the source needs.
 _SENSORS: Final[Mapping[FilterSource, tuple[str, ...]]] = {
     "wheel": ("tachometer",),
     "radar": ("radar",),
@@ -61,19 +61,19 @@ class Effect:
     sources: tuple[str, ...]  #: Measurement sources of the filter along the track; empty for single-epoch positions.
 
     antenna: str
-    epochs: int  #: Number of epochs with observations; if a reference is given, also with a reference position.
+    epochs: int  #: Number of epochs with observations and, if a reference is given, with a reference position.
     rate: float  #: Fraction of the epochs that have coordinates.
-    ok_rate: float  #: Fraction of the epochs with status ok; for the filter, with status tracking.
+    ok_rate: float  #: Fraction of the epochs with status `ok` (filter: status `tracking`).
     n_used: float  #: Mean number of satellites used.
     #: Median of the standard deviation along the line over the epochs with coordinates; NaN without such epochs.
     sigma_p50_m: float
-    coordinates: Score | None = None  #: Errors of all positions; None without a reference.
+    coordinates: Score | None = None  #: Errors at all epochs with coordinates; None without a reference.
     ok: Score | None = None  #: Errors of the positions with status ok; None without a reference.
     #: Errors of the conventional positions from the same ranges; None without a reference.
     conventional: Score | None = None
     #: Errors at epochs without observations, for example in tunnels; None if there are no such epochs or no reference.
     outage: Score | None = None
-    #: 95th percentile of |error| / standard deviation; NaN without a reference.
+    #: 95th percentile of |error| / stated standard deviation; NaN without a reference.
     normalised_p95: float = float("nan")
 
     def as_row(self) -> dict[str, Any]:
@@ -228,7 +228,7 @@ def _settings_of_choices(inputs: RunInputs, config: Config, screens: tuple[str, 
 def _columns(
     result: AntennaResult, track: AlongTrack | None, reference: AntennaReference | None, trajectory: Trajectory
 ) -> dict[str, Floats]:
-    """Return the columns from which the effect on one antenna is computed, for one chunk; each has shape (T,).
+    """Return, for one chunk, the columns from which the effect on one antenna is computed; each has shape (T,).
 
     Positions and standard deviations are taken from the filter if `track` is given. Masks are stored as 1.0 and 0.0.
     """

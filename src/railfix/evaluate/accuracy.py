@@ -19,9 +19,9 @@ from railfix.core.arrays import Floats, Integers, Masks
 from railfix.core.reasons import Status
 from railfix.evaluate.evaluation_inputs import EvaluationOptions, floats
 
-#: Error, or distance from the reference, above which a position counts as wrong [m].
+#: A position counts as wrong if its error, or its distance from the reference, exceeds this value [m].
 WRONG_PLACE_M = 50.0
-#: Error magnitudes [m]; the fraction of errors above each of them is reported.
+#: The fraction of errors whose magnitude exceeds each of these values is reported [m].
 OVER_M: Final = (5, 10, 20, 50)
 
 
@@ -64,9 +64,9 @@ def score(error_m: Floats, observed: Masks) -> Score:
 
 #: Lower edges of the classes of epochs by number of used satellites.
 _SATELLITE_EDGES: Final = (4, 5, 6, 7, 8, 10, 12, 15, 20)
-#: Minimum number of blocks for confidence limits.
+#: Confidence limits are computed only from at least this number of time blocks.
 FEWEST_BLOCKS: Final = 5
-#: Number of values at which the cumulative counts are evaluated in one step of the search for a percentile.
+#: Number of error values at which one step of the search for a percentile counts the smaller errors.
 _NODES: Final = 400
 
 
@@ -134,7 +134,7 @@ def block_limits(
 
 
 def _percentiles(size: Floats, member: Integers, times: Floats, errors: Floats, *, share: float) -> Floats:
-    """Compute the percentile of each resample, shape (replicates,), by counting values at increasingly fine nodes.
+    """Compute the percentile of each resample, shape (replicates,), by counting values up to nodes of ever finer grids.
 
     `size` and the block numbers `member` have shape (T,). `times`, shape (replicates, blocks), states how often each
     block is in a resample. `errors` is the number of values of each resample; the result is NaN for a resample without
@@ -163,20 +163,20 @@ def _percentiles(size: Floats, member: Integers, times: Floats, errors: Floats, 
             most = high - low + 1
 
 
-#: Kinds of position: on the map, on the map with every check passed, and 3-D single point moved to the nearest point of
-#: the line.
+#: Kinds of position: computed with the map; computed with the map, with every check passed; 3-D single point moved to
+#: the nearest point of the line.
 POSITIONS: Final = ("constrained", "constrained_ok", "conventional")
-#: Columns that identify a row of every table.
+#: First columns of every table, which identify the run and antenna of a row.
 KEYS: Final = ("run", "configuration", "line", "antenna")
-#: Groupings with confidence limits.
+#: Groupings for which confidence limits are computed.
 WITH_LIMITS: Final = ("all", "section", "environment", "speed", "configuration", "line")
-#: Data type of name columns during grouping; these columns have many rows and few distinct names.
+#: Data type of the columns of names during grouping, because these columns have many rows and few distinct names.
 WORDS: Final = pl.Categorical()
 #: Name of the group of all epochs; also the entry in ``antenna``, ``run`` or ``line`` of rows that combine several
 #: antennas, runs or lines.
 ALL: Final = "all"
-#: Groups of the grouping ``signals``: epochs at which the single-epoch solution used a satellite, and epochs at which
-#: it used none.
+#: The groups of the grouping ``signals``: epochs at which the single-epoch solution used at least one satellite, and
+#: all other epochs.
 WITH_SATELLITES: Final = "with satellites"
 WITHOUT_SATELLITES: Final = "without satellites"
 AIDED: Final = pl.col("observed") & (pl.col("n_used").fill_null(0) > 0)
@@ -190,7 +190,7 @@ FIGURE_COLUMNS: Final[dict[str, str]] = {
     "configuration": "settings of the run",
     "line": "name of the track",
     "antenna": "`front` or `rear`; `all` where both are combined",
-    "position": "`constrained`: positions on the map; `constrained_ok`: positions on the map that passed every check; "
+    "position": "`constrained`: positions computed with the map; `constrained_ok`: those that passed every check; "
     "`conventional`: 3-D single points at the nearest point of the line",
     "epochs_of": "`own`: all positions of this kind; `common`: only positions at epochs with both a constrained and a "
     "conventional position",
@@ -199,8 +199,8 @@ FIGURE_COLUMNS: Final[dict[str, str]] = {
     "positions": "number of epochs with a reference and a position",
     "left_out": "number of positions whose error is unknown because the reference is not accurate enough",
     "errors": "number of positions whose error is known",
-    "rate": "fraction of the `observed` epochs with a position",
-    "rate_of_run": "fraction of the `epochs` with a position",
+    "rate": "fraction of the `observed` epochs that have a position",
+    "rate_of_run": "fraction of the `epochs` that have a position",
     "mean_m": "mean error, + toward the end of the line",
     "std_m": "population standard deviation of the error",
     "rms_m": "root mean square error",
@@ -215,7 +215,7 @@ FIGURE_COLUMNS: Final[dict[str, str]] = {
     "along_sigma_p50_m": "median of the standard deviation along the line, as stated by the run",
     **dict.fromkeys(
         ("distance_p50_m", "distance_p95_m", "distance_max_m"),
-        "percentile or maximum of the straight distance (3-D) from the position on the map to the reference",
+        "percentile or maximum of the straight distance (3-D) from the position computed with the map to the reference",
     ),
     **dict.fromkeys(("normalised_mean", "normalised_rms"), "mean or root mean square of error / along_sigma"),
     **dict.fromkeys(("normalised_p68", "normalised_p95"), "percentile of the magnitude of error / along_sigma"),
@@ -223,9 +223,9 @@ FIGURE_COLUMNS: Final[dict[str, str]] = {
     "blocks": "number of time blocks from which the confidence limits are computed",
     **dict.fromkeys(LIMIT_COLUMNS, "lower (`_low`) or upper (`_high`) confidence limit"),
 }
-#: Statuses of positions that passed every check, in single epochs and in the filter along the track.
+#: Statuses of positions that passed every check: `ok` for single epochs, `tracking` for the filter along the track.
 PASSED: Final[tuple[str, ...]] = (Status.OK.text, "tracking")
-#: Columns of the table of epochs from which the error statistics are computed, in addition to `KEYS`.
+#: Columns of the epoch table that are required to compute error statistics, in addition to `KEYS`.
 USED: Final = (
     "time_gpst", "status", "observed", "in_reference", "reference_good", "chainage_m", "speed_mps", "environment",
     "reference_sigma_m", "n_used", "positioned", "conventional_positioned",
@@ -349,7 +349,7 @@ def _order(table: pl.DataFrame, grouping: str) -> pl.DataFrame:
 
 
 def at_largest(column: str, by: str) -> pl.Expr:
-    """Return the value of `column` in the first row where the column `by` is largest; null where `by` is all null."""
+    """Return the value of `column` in the first row where `by` is largest; null if all values of `by` are null."""
     return pl.col(column).get(pl.col(by).arg_max())
 
 

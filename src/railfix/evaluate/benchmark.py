@@ -45,11 +45,11 @@ from railfix.track.trajectory import Trajectory
 RTKLIB_SINGLE: Final = "RTKLIB single point"
 #: RTKLIB's program that computes single-point positions (Debian package rtklib).
 RTKLIB_PROGRAM: Final = "rnx2rtkp"
-#: Largest time difference between a position and the epoch to which it belongs, as a fraction of the median interval of
-#: the epochs.
+#: A position belongs to an epoch only if their time difference is at most this fraction of the median interval of the
+#: epochs.
 _NEAR: Final = 0.4
 _LONGEST_S: Final = 600.0  #: Time after which RTKLIB is stopped [s].
-#: Bits of the constellations in RTKLIB's option pos1-navsys.
+#: Bit of each constellation in RTKLIB's option pos1-navsys.
 _SYSTEMS: Final = {"G": 1, "R": 4, "E": 8, "J": 16, "C": 32}
 
 
@@ -105,7 +105,7 @@ def table_of_positions(log: PositionLog, epochs: pl.DataFrame, trajectory: Traje
 
 
 def write_program_run(log: PositionLog, run: Path, out: Path, antenna: Antenna) -> None:
-    """Write another program's positions in the format of a run to `out`; `run` is railfix's run on the same log.
+    """Write another program's positions to `out`, in the format of a run; `run` is railfix's run on the same log.
 
     Raise MismatchError if the run has fewer than two epochs of the antenna, or the log has no position at these epochs.
     """
@@ -185,7 +185,7 @@ _OF_STANFORD: Final = (
     "alarm_limit_m", "judged", "nominal", "misleading", "hazardously_misleading", "unavailable",
     "unavailable_misleading", "availability", "continuity_15_s",
 )  # fmt: skip
-#: Columns of the table with their meaning; error statistics are described as in `railfix evaluate`.
+#: Columns of the table with their meaning; the error statistics are those of `railfix evaluate`.
 BENCHMARK_COLUMNS: Final[dict[str, str]] = {
     "case": "name of the folder of the case",
     "held_out": "whether the case is reserved: no test reads it and no setting was chosen with it",
@@ -280,7 +280,7 @@ def _judge(case: Case, run: CampaignRun, out: Path) -> tuple[list[dict[str, Any]
 
 
 def _programs(case: Case, run: CampaignRun, out: Path) -> tuple[dict[str, Path], list[str]]:
-    """Write the positions of each other program as the folder of a run; return the folders by program, and notes."""
+    """Write each other program's positions into a folder in the format of a run; return the folders, and notes."""
     out.mkdir(parents=True, exist_ok=True)
     notes: list[str] = []
     single = out / "rtklib-single.pos"

@@ -17,9 +17,9 @@ from railfix.evaluate.evaluation_inputs import EvaluationOptions
 from railfix.pipeline.config import Config
 from railfix.run.inputs import Antenna, ColumnNames, RunInputs, RunOptions
 
-#: Name of the file that makes a folder a case.
+#: A folder with a file of this name is a case.
 CASE_FILE: Final = "case.toml"
-#: Inputs of a run that a case must not have, because all cases share one configuration.
+#: Run inputs that a case must not contain, because all cases share one configuration.
 _SETTINGS: Final = ("config", "cn0_curve", "error_model", "sbas")
 
 
@@ -53,11 +53,11 @@ class CaseFile(Settings):
     """Content of ``case.toml``; paths are relative to the folder of the case."""
 
     licence: str = Field(min_length=1)  #: Licence of the data.
-    fetch: str = Field(min_length=1)  #: Source of the data, such as a URL.
+    fetch: str = Field(min_length=1)  #: Where the data can be fetched, such as a URL.
     held_out: bool  #: Whether the case is reserved for the benchmark: no test and no choice of settings uses it.
     files: RunInputs  #: Inputs of `railfix run`, with the ground truth as `truth`.
     sha256: dict[str, str]  #: SHA-256 of every file, by the path in `files` or `positions`.
-    positions: dict[str, OtherPositions] = Field(default_factory=dict)  #: Positions by the name of the program.
+    positions: dict[str, OtherPositions] = Field(default_factory=dict)  #: Positions by name of the other program.
     scenario: RecordedScenario = RecordedScenario()
     options: RunOptions = RunOptions()
     evaluation: EvaluationOptions = EvaluationOptions()
@@ -88,7 +88,7 @@ class Case:
                 raise InputFileError(path, f"there is no such file; fetch it: {self.content.fetch}")
             if (found := file_sha256(path)) != stated.lower():
                 raise InputFileError(
-                    path, f"has the SHA-256 {found[:12]}..., {CASE_FILE} states {stated[:12]}...; fetch it again: "
+                    path, f"has the SHA-256 {found[:12]}..., but {CASE_FILE} states {stated[:12]}...; fetch it again: "
                     f"{self.content.fetch}"
                 )  # fmt: skip
 
@@ -101,7 +101,7 @@ def read_case(folder: Path) -> Case:
     path = folder / CASE_FILE
     content = load_settings(CaseFile, path, what="a case of a benchmark")
     if content.files.truth is None:
-        raise SettingsError(f"{path}: setting files.truth is missing; name the ground truth")
+        raise SettingsError(f"{path}: setting files.truth is missing; give the file with the ground truth")
     if given := [name for name in _SETTINGS if getattr(content.files, name)]:
         raise SettingsError(f"{path}: files.{given[0]} is a setting; all cases have one configuration (--config)")
     root = folder.absolute()

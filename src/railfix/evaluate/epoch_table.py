@@ -18,7 +18,7 @@ from railfix.evaluate.place import Answers, PlaceErrors, TrackFiles, bracket, co
 from railfix.io.reference_log import AntennaReference
 from railfix.io.sections import Sections
 
-#: Status of an epoch missing in the log.
+#: Status of an epoch that is missing in the log.
 NOT_LOGGED: Final = "not_logged"
 #: Environment of epochs for which neither the reference nor the sections state an environment.
 UNKNOWN: Final = "unknown"
@@ -41,20 +41,20 @@ EPOCH_COLUMNS: Final[dict[str, str]] = {
     "reference_sigma_m": "standard deviation of the reference along the track",
     "reference_source": "source of the reference position",
     "n_used": "number of satellites used",
-    "positioned": "whether there is a position on the map",
+    "positioned": "whether there is a position computed with the map",
     "conventional_positioned": "whether there is a 3-D single point",
-    "error_m": "error of the position on the map, + toward the end of the line",
+    "error_m": "error of the position computed with the map, + toward the end of the line",
     "conventional_error_m": "error of the trajectory point nearest to the 3-D single point position, + toward the end "
     "of the line",
-    "distance_m": "straight distance (3-D) from the position on the map to the reference",
+    "distance_m": "straight distance (3-D) from the position computed with the map to the reference",
     "along_sigma_m": "standard deviation along the line, as stated by the run",
-    "branch_probability": "probability of the branch, for the filter along the track",
+    "branch_probability": "probability of the branch (only in rows of the filter along the track)",
     "sources": "measurements that the filter used",
     "interval_m": "distance travelled since the previous position",
     "gap_s": "time since the previous position",
     "conventional_interval_m": "distance travelled since the previous conventional position",
     "conventional_gap_s": "time since the previous conventional position",
-    "block": "number of the time block within the run, for confidence limits",
+    "block": "index of the time block within the run, for confidence limits",
 }
 
 #: Expression that is true for rows of the filter's table, the only table with branch probabilities.
@@ -71,7 +71,7 @@ class AntennaEpochs:
     errors: PlaceErrors
     speed_from: str  #: Source of the speed: "reference", or "places" if computed from positions of the reference.
     outside: int  #: Number of epochs of the log that the reference does not cover.
-    step_s: float  #: Median interval of the log; NaN with fewer than two epochs.
+    step_s: float  #: Median interval between the epochs of the log; NaN with fewer than two epochs.
     from_sections: int  #: Number of epochs with a reference at which the environment is taken from the sections.
 
 
@@ -88,7 +88,7 @@ def protection_columns(table: pl.DataFrame) -> list[str]:
 
 
 def below(tables: Sequence[pl.DataFrame]) -> pl.DataFrame:
-    """Concatenate tables of epochs; a column that a table lacks is null in the rows of that table.
+    """Concatenate tables of epochs; if a table lacks a column, its rows have null in this column.
 
     The columns are removed from the given tables one by one, to save memory.
     """
@@ -177,7 +177,7 @@ def antenna_epochs(
     if not (at.inside & logged).any():
         spans = [f"({t[0]} to {t[-1]})" for t in (time, reference.time)]
         raise MismatchError(
-            f"{run.path}: the {antenna} antenna's epochs {spans[0]} and its reference {spans[1]}, GPS time, have no "
+            f"{run.path}: the {antenna} antenna's epochs {spans[0]} and its reference {spans[1]} (GPS time) have no "
             "time in common; give the reference of this run"
         )
     answers = own.answers(chainage, place)
@@ -232,7 +232,7 @@ class _OwnColumns(NamedTuple):
     """Columns of an antenna's positions, extended to the epochs that are missing in the log."""
 
     table: pl.DataFrame
-    rows: Indices  #: Row of the table for each epoch; for a missing epoch, the number of rows of the table.
+    rows: Indices  #: Row index in the table for each epoch; for a missing epoch, the index after the last row.
 
     def floats(self, name: str) -> Floats:
         """Return a column of numbers, NaN for missing epochs."""

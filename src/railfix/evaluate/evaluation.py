@@ -33,7 +33,7 @@ from railfix.io.sections import read_sections
 
 #: File names under which a reference is searched for in the folder of a run's log.
 BESIDE_THE_LOG: Final = ("truth.csv", "truth.csv.gz", "reference.csv", "reference.csv.gz")
-#: Columns that are read from a table of positions in addition to the columns that every table must have.
+#: Columns read from a table of positions, if present, in addition to the columns that every table must have.
 _COLUMNS: Final = cs.by_name("branch_probability", "sources", require_all=False) | cs.contains("protection_")
 _FACTS: Final = ("speed_from", "outside", "step_s")
 #: Offset between the block numbers of successive runs, so that each block number is unique.
@@ -51,9 +51,9 @@ class RunAndReference:
     #: one of the names `BESIDE_THE_LOG`.
     reference: Reference = None
     configuration: str | None = None  #: Name of the configuration; if None, a name is made from the settings.
-    table: str = POSITIONS_TABLE  #: Name of the table, see `railfix.evaluate.evaluation_inputs.list_position_tables`.
+    table: str = POSITIONS_TABLE  #: Table of positions (`railfix.evaluate.evaluation_inputs.list_position_tables`).
     #: Folder of another run on the same log; its conventional positions replace those of `run`. In the comparison of
-    #: P1, the other run uses only the elevation and C/N0 screens.
+    #: paper P1, the other run uses only the elevation and C/N0 screens.
     conventional: Path | None = None
 
 
@@ -65,12 +65,12 @@ class EvaluatedRun:
     configuration: str
     line: str
     path: Path
-    table: str  #: Name of the table of positions.
+    table: str  #: Name of the table of positions that was evaluated.
     reference: str  #: File of the reference, or "given" for arrays.
     method: Mapping[str, str]  #: Method by which the errors of each antenna were computed: "chainage" or "trajectory".
     speed_from: Mapping[str, str]  #: Source of the speed by antenna: "reference" or "places".
-    outside: Mapping[str, int]  #: Number of epochs of the log outside the reference, by antenna.
-    step_s: Mapping[str, float]  #: Median interval of the log, by antenna.
+    outside: Mapping[str, int]  #: Number of epochs of the log that the reference does not cover, by antenna.
+    step_s: Mapping[str, float]  #: Median interval between the epochs of the log, by antenna.
     protection: Mapping[str, Any]  #: Basis of the protection levels, from ``run.json``.
     settings: Mapping[str, Any]
     inputs: tuple[Mapping[str, Any], ...]  #: Files that were read, with size and hash.
@@ -96,7 +96,7 @@ class Evaluation(NotebookTable):
     inputs: tuple[Mapping[str, Any], ...] = ()  #: Files of all runs, with size and hash.
 
     def figure(self, name: str, **where: str) -> Any:
-        """Return the value in column `name` of the row of `figures` that has the values `where`, given by column name.
+        """Return the value in column `name` of one row of `figures`; `where` selects the row by values of columns.
 
         The defaults are `grouping` "all", `epochs_of` "own" and `position` "constrained". Raise LookupError unless
         exactly one row has these values.
@@ -191,7 +191,7 @@ def _evaluate(
     files: TrackFiles,
     options: EvaluationOptions,
 ) -> tuple[EvaluatedRun, list[pl.DataFrame], Level | None]:
-    """Evaluate a run; return it without a name, the epochs of its antennas, and the kind and limit of its levels.
+    """Evaluate a run; return the unnamed run, the epochs of its antennas, and the kind and alarm limit of its levels.
 
     References that are read from files are kept in `read`, so that several runs share them.
     """
@@ -224,8 +224,8 @@ def _evaluate(
     ]
     if stretches is not None:
         notes += [
-            f"{name}: the sections give the environment of {antenna.from_sections} of "
-            f"{int(antenna.table['in_reference'].sum())} epochs, for which the reference states none"
+            f"{name}: for {antenna.from_sections} of {int(antenna.table['in_reference'].sum())} epochs, the reference "
+            "states no environment; it is taken from the sections"
             for name, antenna in antennas.items()
         ]
     if folder.level_kind == UNKNOWN_KIND:
@@ -270,7 +270,7 @@ def _references(
         return item.reference, None
     path = item.reference or reference_beside(folder)
     if path.resolve().parent == item.run.resolve() and path.name.split(".")[0] in TABLES:
-        raise MismatchError(f"{path}: is a table of the run itself; give the reference of an independent measurement")
+        raise MismatchError(f"{path}: is a table of the run itself; give a reference from an independent measurement")
     key = path, tuple(folder.antennas)
     if key not in read:
         reading = options.columns.arguments
@@ -285,7 +285,7 @@ def reference_beside(run: RunFolder) -> Path:
     """
     logs = run.input_paths("front")
     if not logs:
-        raise InputFileError(run.path / "run.json", "names no log of the front antenna; name the reference")
+        raise InputFileError(run.path / "run.json", "names no log of the front antenna; give the reference file")
     folder = logs[0].parent
     paths = [folder / name for name in BESIDE_THE_LOG if (folder / name).is_file()]
     if not paths:
@@ -299,7 +299,7 @@ def reference_beside(run: RunFolder) -> Path:
 
 
 def configurations(settings: Sequence[Mapping[str, Any]], given: Sequence[str]) -> list[str]:
-    """Return a name for the settings of each run: the given label, or the preset and the settings that differ.
+    """Return a name for each run's settings: the given label, or the preset and the settings that differ between runs.
 
     The name of a single run consists of the preset and the screens.
     """
@@ -338,7 +338,7 @@ def short_names(paths: Sequence[Path]) -> list[str]:
 
 
 def _figures(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
-    """Return the error statistics by grouping of each run and, if there are several runs, of each configuration."""
+    """Return the error statistics by grouping, for each run and (if there are several) each configuration."""
     epochs = epochs.select(*KEYS, *USED)
     groupings = ("all", "section", "environment", "speed", "satellites", "signals", "status")
     tables = [figures_by(_parts(epochs, "run", ()), groupings, options)]
@@ -350,7 +350,7 @@ def _figures(epochs: pl.DataFrame, options: EvaluationOptions) -> pl.DataFrame:
 
 
 def _parts(epochs: pl.DataFrame, by: str, as_one: Sequence[str]) -> Iterator[pl.DataFrame]:
-    """Yield, for each value in the column `by`, the rows with this value, and with `ALL` in the columns `as_one`.
+    """Yield, for each value in the column `by`, the rows with this value; the columns `as_one` are set to `ALL`.
 
     If there are two antennas, yield the rows of each value a second time, with `ALL` in the column ``antenna``.
     """
@@ -360,7 +360,7 @@ def _parts(epochs: pl.DataFrame, by: str, as_one: Sequence[str]) -> Iterator[pl.
 
 
 def _intervals(epochs: pl.DataFrame) -> pl.DataFrame:
-    """Return the intervals by antenna of each run and, if there are several runs, of each configuration."""
+    """Return, for each run and (if there are several runs) each configuration, the intervals by antenna."""
     table = interval_table(epochs, list(KEYS))
     if epochs["run"].n_unique() < 2:
         return table

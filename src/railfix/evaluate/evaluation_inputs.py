@@ -26,7 +26,7 @@ from railfix.run.record import RunRecord, read_parquet, read_record
 
 #: Columns that every table of positions must have.
 NEEDED: Final = ("time_gpst", "antenna", "status", "chainage_m", "along_sigma_m", "x_m", "y_m", "z_m")
-#: Selector that matches no column, so that only the columns `NEEDED` are read.
+#: Selector of no further column: only the columns `NEEDED` are read.
 NO_MORE: Final = ~cs.all()
 #: Columns of the conventional position.
 CONVENTIONAL: Final = ("conventional_chainage_m", "conventional_x_m", "conventional_y_m", "conventional_z_m")
@@ -90,7 +90,7 @@ class RunFolder(RunRecord):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Settings that the run used, by dotted name, and entries for the optional kinds of input that it was given."""
+        """Settings that the run used, by dotted name, and one entry for each optional kind of input that it used."""
         flat = flat_settings(self.record.get("settings_used") or {})
         kinds = {str(entry["input"]) for entry in self.entries}
         return flat | {f"input {kind}": "given" for kind in sorted(kinds - {"front", "nav", "track", "config"})}
@@ -171,7 +171,7 @@ def read_run(
     """Read the record and one table of positions from a folder that `railfix run` wrote.
 
     `columns` selects columns in addition to the required columns; by default all columns are read. `conventional` is
-    the folder of another run on the same log, whose conventional positions replace the run's own.
+    the folder of another run on the same log; its conventional positions replace the run's own.
 
     Raise InputFileError if a file is missing or the table is not as expected, MismatchError if `conventional` is
     a run on another log.
@@ -213,16 +213,16 @@ def read_table(
     """
     file = next((path / f"{name}{end}" for end in _ENDINGS if (path / f"{name}{end}").is_file()), None)
     if file is None:
-        raise InputFileError(path, f"holds neither {name}.parquet nor {name}.csv; name a folder of railfix run")
+        raise InputFileError(path, f"contains neither {name}.parquet nor {name}.csv; give a folder of railfix run")
     rows = _table(file, None if columns is None else cs.by_name(*needed, require_all=False) | columns)
     missing = [column for column in needed if column not in rows.columns]
     if missing:
-        raise InputFileError(file, f"has no column {missing[0]}; expected the {name} of railfix run")
+        raise InputFileError(file, f"has no column {missing[0]}; expected the table {name} that railfix run wrote")
     if not len(rows):
         raise InputFileError(file, "has no rows; there is nothing to evaluate")
     rows = rows if rows["time_gpst"].is_sorted() else rows.sort("time_gpst", maintain_order=True)
     if rows.select("antenna", "time_gpst").drop_nulls().is_duplicated().any():
-        raise InputFileError(file, "has an antenna twice at one time; expected one row per epoch and antenna")
+        raise InputFileError(file, "has two rows of one antenna at one epoch; expected one row per epoch and antenna")
     return file, rows
 
 
@@ -264,9 +264,9 @@ def words(table: pl.DataFrame, name: str) -> Strings:
 
 Method = Literal["chainage", "trajectory"]
 
-#: Longest interval between two reference positions over which the reference is interpolated [s].
+#: The reference is interpolated between two of its positions if they are at most this time apart [s].
 LARGEST_GAP_S: Final = 2.5
-#: Durations of the windows for continuity [s]: 15 s as for an approach in aviation, 60 s as for a journey between two
+#: Durations of the windows for continuity [s]: 15 s is used for an approach in aviation, 60 s for a journey between two
 #: stations.
 WINDOWS_S: Final = (15.0, 60.0)
 
@@ -300,7 +300,7 @@ class EvaluationInputs(Settings):
     )
     conventional: Path | None = option(
         "Folder of another run on the same log; its conventional positions replace those of the run. A run with "
-        "`--screens elevation` provides unscreened positions, as in P1.",
+        "`--screens elevation` provides unscreened positions, as in paper P1.",
         None,
         metavar="RUN",
         panel=INPUTS,
@@ -312,7 +312,7 @@ class EvaluationInputs(Settings):
         panel=INPUTS,
     )
     label: tuple[str, ...] = option(
-        "Name of the configuration of a run, repeated for each run in order; by default, made from the settings.",
+        "Name of a run's configuration; repeat the option for each run in order. By default made from the settings.",
         (),
         metavar="TEXT",
     )
@@ -327,18 +327,18 @@ class EvaluationOptions(Settings):
         "auto",
     )
     reference_sigma_m: Positive = option(
-        "Largest standard deviation of a reference position that is used.", 0.5, name="--reference-sigma", metavar="M"
+        "Reference positions with a larger standard deviation are not used.", 0.5, name="--reference-sigma", metavar="M"
     )
     reference_quality: tuple[int, ...] = option(
-        "Quality numbers of the reference positions that are used, if the log has quality numbers (RTKLIB: 1 fix, "
-        "2 float, 5 single).",
+        "Quality numbers of the reference positions to use, if the log has quality numbers (RTKLIB: 1 fix, 2 float, "
+        "5 single).",
         (1,),
         name="--reference-quality",
         metavar="Q,...",
     )
     columns: ColumnNames = Field(default_factory=ColumnNames)
     reference_gap_s: Positive = option(
-        "Longest gap over which the reference is interpolated.", LARGEST_GAP_S, name="--reference-gap", metavar="S"
+        "The reference is not interpolated in longer gaps.", LARGEST_GAP_S, name="--reference-gap", metavar="S"
     )
     standing_mps: Positive = option(
         "Speed below which the train counts as stationary.", 0.3, name="--standing", metavar="M/S"
@@ -354,6 +354,6 @@ class EvaluationOptions(Settings):
         metavar="M,...",
     )
     block_s: Positive = 60.0  #: Length of the time blocks that are resampled for confidence limits.
-    replicates: int = Field(default=1000, ge=1)  #: Number of resamples.
+    replicates: int = Field(default=1000, ge=1)  #: Number of bootstrap samples for the confidence limits.
     seed: int = option("Seed of the random numbers of the confidence limits.", 0, metavar="N", ge=0)
-    confidence: float = Field(default=0.95, gt=0.0, lt=1.0)  #: Probability of the confidence limits, between 0 and 1.
+    confidence: float = Field(default=0.95, gt=0.0, lt=1.0)  #: Confidence level of the limits, between 0 and 1.

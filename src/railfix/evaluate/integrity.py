@@ -21,16 +21,16 @@ from railfix.integrity.stanford import Region, Stanford, stanford
 
 LevelsOf = Literal["usable", "all"]
 
-#: Choices of the protection levels that are compared with errors; the docstring of this module defines them.
+#: Choices of the protection levels that are compared with errors, as defined in the docstring of this module.
 LEVELS_OF: Final[tuple[LevelsOf, ...]] = ("usable", "all")
-#: Columns of the parts of a protection level, without the prefix "protection_".
+#: Names, without the prefix "protection_", of the columns with the parts of a protection level.
 PARTS: Final[tuple[str, ...]] = ("fault_free_m", "one_fault_m", "two_faults_m")
-#: Columns of the cause and the status of a protection level, without the prefix "protection_".
+#: Names, without the prefix "protection_", of the columns with the cause and the status of a protection level.
 STATED: Final[tuple[str, ...]] = ("cause", "status")
 _ALARM: Final = "alarm"
 #: Columns of the table of epochs that a Stanford diagram requires, in addition to the protection level and its status.
 _JUDGED: Final = ("time_gpst", "status", "in_reference", "reference_good", "positioned", "error_m")
-#: Statuses of positions whose protection level bounds the error; a coasting filter is included.
+#: Statuses of positions whose protection level bounds the error, including positions of a coasting filter.
 _BOUNDED: Final = (*PASSED, "coasting")
 _REGIONS: Final = {
     Region.NOMINAL: "nominal",
@@ -42,7 +42,7 @@ _REGIONS: Final = {
     Region.NO_POSITION: "no_position",
 }
 
-#: Columns of the table of counts in addition to `KEYS`, with their meaning.
+#: Columns of the table of Stanford counts in addition to `KEYS`, with their meaning.
 STANFORD_COLUMNS: Final[dict[str, str]] = {
     "grouping": "`all` or `environment`",
     "group": "name of the group",
@@ -62,7 +62,7 @@ STANFORD_COLUMNS: Final[dict[str, str]] = {
     "no_position": "epochs with neither a protection level nor a known error",
     "available": "epochs with a level within AL, whether or not the error is known",
     "availability": "available / epochs",
-    "availability_of_observed": "fraction of the `observed` epochs with a level within AL",
+    "availability_of_observed": "fraction of the `observed` epochs that have a level within AL",
     "beyond": "errors above a finite protection level; the number is the same at every AL",
     "beyond_share": "beyond / judged",
     "beyond_blocks": "time blocks (60 s) with an error above a finite protection level",
@@ -79,18 +79,18 @@ BEYOND_COLUMNS: Final[dict[str, str]] = {
     "antenna": "`front` or `rear`",
     "chainage_m": "chainage of the reference",
     "environment": "environment stated by the reference, else by the sections, else `unknown`",
-    "error_m": "error of the position on the map, + toward the end of the line",
+    "error_m": "error of the position computed with the map, + toward the end of the line",
     "KIND_level_m": "protection level",
     **dict.fromkeys(("KIND_fault_free_m", "KIND_one_fault_m", "KIND_two_faults_m"), "part of the level"),
     "KIND_cause": "cause of the level",
     "KIND_status": "status of the level",
     "status": "status of the epoch",
     "n_used": "number of satellites used",
-    "usable": "whether the level was usable, so that the epoch is misleading information",
+    "usable": "whether the level was usable, so that the position is misleading information",
 }
 
 
-#: Kind of a run's protection levels, which is the prefix of their columns, and the run's alarm limit [m] or None.
+#: Kind of a run's protection levels (the prefix of their columns), and the run's alarm limit [m]; None without a limit.
 Level = tuple[str, float | None]
 
 
@@ -103,7 +103,7 @@ class Integrity:
 
 
 def level_name(kind: str) -> str:
-    """Return the name of the epochs table's column with the protection levels of a kind."""
+    """Return the name of the column of the epoch table with the protection levels of the given kind."""
     return f"{kind}_protection_level_m"
 
 
@@ -136,7 +136,7 @@ def epochs_diagram(
 def _judge(spanned: pl.DataFrame, kind: str, levels_of: LevelsOf) -> tuple[Floats, Floats]:
     """Return the errors and `effective_levels` of epochs within the reference, shape (T,) each [m].
 
-    The error is NaN without a position or a sufficiently accurate reference.
+    The error is NaN if there is no position, or no sufficiently accurate reference.
     """
     has = spanned["positioned"].to_numpy()
     error = np.where(has & spanned["reference_good"].to_numpy(), floats(spanned, "error_m"), np.nan)

@@ -104,14 +104,14 @@ def _seconds(duration: pl.Expr) -> pl.Expr:
     return duration.dt.total_nanoseconds() / 1e9
 
 
-#: Minimum duration of the stretches without satellites that are listed in the table [s].
+#: Stretches without satellites are listed in the table if they last at least this time [s].
 LEAST_S: Final = 2.0
 
 #: Columns of the table of stretches without satellites in addition to its keys, with their unit and meaning.
 OUTAGE_COLUMNS: Final[dict[str, str]] = {
     "begin_gpst": "first epoch without a used satellite, GPS time",
     "duration_s": "time from the last epoch with a used satellite to the last epoch without a used satellite",
-    "travelled_m": "distance travelled in the stretch, from the reference",
+    "travelled_m": "distance travelled in the stretch, computed from the reference",
     "environment": "environment in the middle of the stretch, from the reference or from the sections",
     "carried_by": "measurements that the filter used within the stretch",
     "epochs": "number of epochs of the stretch",
@@ -166,7 +166,7 @@ def outage_table(epochs: pl.DataFrame) -> pl.DataFrame | None:
     return table.filter(pl.col("duration_s") >= LEAST_S).select(*keys, *OUTAGE_COLUMNS)
 
 
-#: Limits between the classes of the branch probability.
+#: Limits of the classes of the branch probability.
 _EDGES: Final = (0.0, 0.5, 0.9, 0.99, 0.999, 1.0)
 
 _BRANCH_COLUMNS: Final = ("in_reference", "reference_good", "positioned", "branch_probability", "distance_m", "block")
@@ -217,7 +217,7 @@ LEVEL_COLUMNS: Final[dict[str, str]] = {
     "positions": "number of epochs with a position",
     "infinite": "number of positions with an infinite protection level",
     "with_level": "number of positions with a finite protection level",
-    "level_share": "fraction of the `observed` epochs with a finite protection level",
+    "level_share": "fraction of the `observed` epochs that have a finite protection level",
     "level_p50_m": "median of the finite protection levels",
     "level_p95_m": "95th percentile of the finite protection levels",
     "errors": "number of positions with a finite protection level and a known error",
@@ -227,7 +227,7 @@ LEVEL_COLUMNS: Final[dict[str, str]] = {
 
 
 def level_table(epochs: pl.DataFrame, by: list[str]) -> pl.DataFrame | None:
-    """Return the counts and percentiles of every protection level (`LEVEL_COLUMNS`), grouped by the columns `by`.
+    """Return counts and percentiles of the protection levels of each kind (`LEVEL_COLUMNS`), grouped by columns `by`.
 
     Return None if no run has a protection level.
     """
@@ -276,10 +276,10 @@ def _counts(level: str) -> list[pl.Expr]:
     ]
 
 
-#: Statuses of the filter whose protection level is used.
+#: Statuses of the filter with which its protection level is used; with other statuses, the level counts as infinite.
 _SOUND: Final = ("tracking", "coasting")
 _POSITION_COLUMNS: Final = ("n_used", "n_rejected", "conventional_offset_m")
-#: Columns of the table of the satellite service by stretch; percentiles are over epochs.
+#: Columns of the table of positioning quality by stretch of line; percentiles are over the epochs of the stretch.
 COLUMNS: Final = (
     "from_m", "to_m", "runs", "epochs", "satellites_median", "satellites_p5", "rejected_share", "reflection_p95_m",
     "ok_share", "tracking_share", "level_median_m", "level_p95_m", "within_limit_share",
@@ -287,7 +287,7 @@ COLUMNS: Final = (
 
 
 def compute_service(folders: Sequence[Path], *, stretch_m: float = 100.0, limit_m: float = 20.0) -> pl.DataFrame:
-    """Compute the satellite service (`COLUMNS`) by stretches of the line, over all antennas and runs.
+    """Compute the quality of positioning (`COLUMNS`) by stretches of the line, over all antennas and runs.
 
     `stretch_m` is the length of a stretch, and `limit_m` is the alarm limit [m]. The chainage of an epoch is taken from
     the filter, else from the single-epoch position, else interpolated between the neighbouring epochs with a position.
@@ -299,8 +299,8 @@ def compute_service(folders: Sequence[Path], *, stretch_m: float = 100.0, limit_
     for folder, run in zip(folders, runs, strict=True):
         if (run.line_name, run.track_facts.get("length_m")) != (runs[0].line_name, first.get("length_m")):
             raise MismatchError(
-                f"{folder}: is on {run.line_name!r} of {run.track_facts.get('length_m')} m, but {folders[0]} is on "
-                f"{runs[0].line_name!r} of {first.get('length_m')} m; give runs on one map"
+                f"{folder}: the line is {run.line_name!r} ({run.track_facts.get('length_m')} m), but the line of "
+                f"{folders[0]} is {runs[0].line_name!r} ({first.get('length_m')} m); give runs on one map"
             )
     parts = [_epochs(folder, run, number) for number, (folder, run) in enumerate(zip(folders, runs, strict=True))]
     epochs = pl.concat(parts, how="vertical").filter(pl.col("chainage_m").is_not_null())

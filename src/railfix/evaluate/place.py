@@ -1,7 +1,7 @@
 """Errors of one antenna along the line, as differences of chainage or along the trajectory.
 
 The error is the distance along the map from the reference position's nearest point on the map to the evaluated
-position. It is positive toward the end of the line (P1 3.3).
+position. It is positive toward the end of the line (paper P1, section 3.3).
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def along_track_error(
     reference_ecef_m : ndarray, shape (T, 3) [m]
         Reference positions.
     same_place_m : float [m]
-        Largest distance from the map to a reference position at which the map counts as passing this position.
+        The map counts as passing a reference position if it is at most this distance away from the position.
     """
     error = np.full(len(arc_m), np.nan)
     at = np.flatnonzero(np.isfinite(arc_m) & np.isfinite(reference_ecef_m[:, 0]))
@@ -143,17 +143,17 @@ def straight_distance(arc_m: Floats, reference_ecef_m: Floats, trajectory: Traje
     return distance
 
 
-#: Run and reference are assumed to use the same map if their distance in chainage differs from their straight distance
-#: by at most this (median) [m].
+#: Run and reference are assumed to use the same map if the median difference between their distance in chainage and
+#: their straight distance is at most this value [m].
 SAME_MAP_M: Final = 1.0
-#: A position farther than this from a trajectory was not computed with this trajectory [m].
+#: A position was computed with a trajectory if it is at most this distance away from the trajectory [m].
 SAME_TRAJECTORY_M: Final = 0.01
-#: Assumed largest distance along the line between two points of a vehicle [m].
+#: Assumed maximum distance along the line between two points of a vehicle [m].
 _WITHIN_VEHICLE_M: Final = 45.0
-#: An error counts as measured to another pass of the line if the distance along the line to the reference's nearest
-#: point exceeds twice the error by more than this [m].
+#: An error counts as measured to another pass of the line if d - 2 |error| exceeds this value [m], where d is the
+#: distance along the line between the position and the point nearest to the reference.
 _ANOTHER_PASS_M: Final = 50.0
-#: Tolerance for rounded chainages at the ends of the line [m].
+#: A chainage beyond an end of the line by at most this distance is regarded as rounded, and accepted [m].
 _ROUNDING_M: Final = 1e-3
 
 
@@ -173,12 +173,12 @@ class TrackFiles(Settings):
 class Answers:
     """Positions of one antenna at T epochs, and the reference at the same epochs."""
 
-    chainage_m: Floats  #: Chainage of the position on the map, shape (T,); NaN without a position.
+    chainage_m: Floats  #: Chainage of the position computed with the map, shape (T,); NaN without a position.
     conventional_chainage_m: Floats  #: Chainage of the conventional position, shape (T,); NaN without a position.
-    ecef_m: Floats  #: Position on the map, shape (T, 3); NaN without a position.
-    #: Chainage of the reference, shape (T,); NaN outside the reference, or where it has no chainage.
+    ecef_m: Floats  #: Position computed with the map, ECEF, shape (T, 3); NaN without a position.
+    #: Chainage of the reference, shape (T,); NaN where the reference has no position or no chainage.
     reference_chainage_m: Floats
-    reference_ecef_m: Floats  #: Position of the reference, shape (T, 3); NaN outside the reference.
+    reference_ecef_m: Floats  #: Position of the reference, shape (T, 3); NaN where it has none.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,13 +186,12 @@ class PlaceErrors:
     """Errors of one antenna at T epochs; signed errors are + toward the end of the line."""
 
     method: Method
-    error_m: Floats  #: Signed error of the position on the map, shape (T,).
+    error_m: Floats  #: Signed error of the position computed with the map, shape (T,).
     conventional_error_m: Floats  #: Signed error of the conventional position, shape (T,).
-    #: Straight distance (3-D) from the position on the map to the reference, shape (T,). With the method "trajectory",
-    #: the distance is to the reference's nearest point on the map; with the method "chainage", to the reference
-    #: position.
+    #: Straight distance (3-D) of the position computed with the map, shape (T,): with the method "trajectory", from the
+    #: point of the map nearest to the reference; with the method "chainage", from the reference position.
     distance_m: Floats
-    #: Chainage of the reference, computed from the map if the reference has none; shape (T,).
+    #: Chainage of the reference, or of the point of the map nearest to the reference if it has no chainage; shape (T,).
     reference_chainage_m: Floats
     files: tuple[tuple[str, Path], ...] = ()  #: Kind ("track" or "vehicle") and path of each file that was read.
     notes: tuple[str, ...] = ()
@@ -209,7 +208,7 @@ def compute_errors(
     """Compute the errors of one antenna.
 
     With the method "auto" the errors are differences of chainage if run and reference share a map (`SAME_MAP_M`),
-    otherwise distances along the trajectory. Raise MismatchError if the reference is of another region, the method
+    otherwise distances along the trajectory. Raise MismatchError if the reference is in another region, the method
     "chainage" is impossible, or the track is not the track of the run; raise InputFileError if a file is missing.
     """
     _check_same_place(run, antenna, answers)
@@ -229,13 +228,13 @@ def compute_errors(
                 ),
                 distance_m=np.linalg.norm(answers.ecef_m - answers.reference_ecef_m, axis=1),
                 reference_chainage_m=answers.reference_chainage_m,
-                notes=(f"{antenna}: the line is closed; errors are in the shorter direction",)
+                notes=(f"{antenna}: the line is closed; each error is in its shorter direction",)
                 if np.isfinite(turn)
                 else (),
             )
         if method == "chainage":
             raise MismatchError(f"{run.path}: {against}; use the trajectory instead (--method trajectory)")
-        notes: tuple[str, ...] = (f"{antenna}: errors are along the trajectory: {against}",)
+        notes: tuple[str, ...] = (f"{antenna}: errors are along the trajectory, because {against}",)
     else:
         notes = (f"{antenna}: errors are along the trajectory, as requested",)
     trajectory, used, more = find_trajectory(run, antenna, answers.chainage_m, answers.ecef_m, files)
@@ -269,7 +268,7 @@ def _check_same_place(run: RunFolder, antenna: str, answers: Answers) -> None:
 def _note_of_passes(
     antenna: str, arc_m: Floats, error_m: Floats, answers: Answers, trajectory: Trajectory
 ) -> tuple[str, ...]:
-    """Return a note on errors that were measured to another pass of the line than the one nearest to the reference."""
+    """Return a note on errors that were not measured to the pass of the line nearest to the reference."""
     known = np.isfinite(error_m)
     nearest, _ = trajectory.nearest(answers.reference_ecef_m[known])
     others = int((np.abs(arc_m[known] - nearest) > 2.0 * np.abs(error_m[known]) + _ANOTHER_PASS_M).sum())
@@ -364,7 +363,7 @@ def _readings(run: RunFolder, files: TrackFiles) -> Sequence[tuple[str | None, s
     if any(given):
         return [given]
     facts, options = run.track_facts, run.track_options
-    # records of earlier versions have no options, only the names that the track states
+    # records of earlier versions have no options, only the names of CRS and height datum that the track states
     source = options or {"crs": facts.get("crs"), "height_datum": facts.get("height_datum_asked")}
     recorded = (source.get("crs") or None, source.get("height_datum") or None, source.get("geoid") or None)
     return [given, recorded] if facts.get("file") else [recorded, given]

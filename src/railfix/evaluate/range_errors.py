@@ -1,4 +1,4 @@
-"""Pseudorange errors at a reference position, without receiver clock and common errors (P1 7, fig. 14).
+"""Pseudorange errors at a reference position, minus receiver clock and common errors (paper P1, section 7, fig. 14).
 
 A nearby reference station measures the common errors. An error model is fitted to the errors of several runs.
 """
@@ -49,7 +49,7 @@ __all__ = [
     "base_station_from_files", "error_model_from_runs", "range_errors", "robust_clock",
 ]  # fmt: skip
 
-#: Rejection reasons with which no range error can be computed: no pseudorange, no ephemeris, no correction.
+#: Rejection reasons of observations without a range error: no pseudorange, no ephemeris, or no correction.
 NO_RANGE: Final = (
     Reason.NOT_OBSERVED
     | Reason.IMPLAUSIBLE_CODE
@@ -67,13 +67,13 @@ NO_RANGE: Final = (
     | Reason.SBAS_NO_IONOSPHERE
 )
 
-#: Largest standard deviation of a reference position that is used [m].
+#: Reference positions with a larger standard deviation are not used [m].
 _LARGEST_REFERENCE_SIGMA_M: Final = 0.5
-#: Longest gap of the reference trajectory over which its positions are interpolated [s].
+#: The reference trajectory is not interpolated in gaps longer than this time [s].
 _LARGEST_REFERENCE_GAP_S: Final = 2.5
-#: Longest gap of the reference station's log over which its range errors are interpolated [s].
+#: Range errors of the reference station are not interpolated in gaps of its log longer than this time [s].
 _LARGEST_BASE_GAP_S: Final = 35.0
-#: Minimum number of ranges of a constellation, after the screens, from which the receiver clock is estimated.
+#: The receiver clock is estimated only from constellations with at least this number of ranges after the screens.
 _LEAST_RANGES: Final = 4
 
 
@@ -83,7 +83,7 @@ class StationErrors:
 
     name: str
     time: Datetimes  #: Time of each epoch, shape (B,).
-    satellite: Strings  #: Satellites, shape (S,).
+    satellite: Strings  #: Names of the satellites, shape (S,).
     #: Corrected pseudorange minus geometric range and receiver clock offset; NaN where not observed; shape (B, S).
     error_m: Floats
     smoothed: bool  #: Whether the pseudoranges were smoothed by carrier phase.
@@ -167,7 +167,7 @@ class RangeErrors:
     samples: ErrorSamples
     time: Datetimes  #: Time of each error, shape (n,).
     satellite: Strings  #: Satellite of each error, shape (n,).
-    epochs: int  #: Number of epochs with a reference position.
+    epochs: int  #: Number of epochs that have a reference position.
 
 
 def range_errors(
@@ -243,7 +243,7 @@ class StationBeside(Settings):
     """Options of the command line for the reference positions of the runs and a reference station."""
 
     reference: tuple[Path, ...] = input_option(
-        "File of reference positions, one for each RUN in order.", metavar="FILE"
+        "File of reference positions; repeat the option for each RUN in order.", metavar="FILE"
     )
     base: tuple[Path, ...] = input_option(
         "RINEX observations of a nearby reference station during all RUNs; may be repeated.",
@@ -300,7 +300,7 @@ def error_model_from_runs(
     runs = [_run_errors(source, number, fit) for number, source in enumerate(inputs)]
     parts = [samples for run in runs for samples in run.samples]
     if not any(len(part.error_m) for part in parts):
-        raise MismatchError("no pseudorange error could be computed; give reference and station of the same run")
+        raise MismatchError("no pseudorange error could be computed; give a reference and station log of the run")
     samples = join_rows(parts)
     conditions = runs[0].conditions
     for source, run in zip(inputs[1:], runs[1:], strict=True):

@@ -23,7 +23,7 @@ from railfix.run.output import OutputFolder
 
 _NAMES: Final = {"constrained": "on the map", "constrained_ok": "on the map, ok", "conventional": "conventional"}
 _POSITION: Final = pl.col("position").replace(_NAMES)
-#: Name of the run, or of the configuration in rows that combine several runs.
+#: Name of the run; in rows that combine several runs, name of the configuration.
 _OF: Final = pl.when(pl.col("run") != "all").then("run").otherwise("configuration").alias("of")
 #: Groupings in the order of their tables, with captions.
 _GROUPINGS: Final = {
@@ -37,16 +37,16 @@ _GROUPINGS: Final = {
     "section": "By section of the line",
 }
 _LEVELS_OF: Final = (
-    "usable: levels of positions with status ok (of the filter: tracking or coasting) and no alarm, other levels count "
+    "usable: levels without an alarm, of positions with status ok (filter: tracking or coasting), other levels count "
     "as infinite; all: every level"
 )
 _AVAILABLE: Final = (
-    "available: fraction of all epochs, tunnels included; 15 s, 60 s: fraction of windows beginning "
-    "at an available epoch that stay available"
+    "available: fraction of all epochs, tunnels included; 15 s, 60 s: of the windows that begin at an available "
+    "epoch, the fraction that stays available"
 )
 
 
-#: Names of the filter's protection levels; all other protection levels are for single-epoch positions.
+#: Names of the protection levels in tables, by column.
 _LEVEL: Final = pl.col("level").replace(
     {
         "train_protection_level_m": "filter, along the line",
@@ -59,7 +59,7 @@ _LEVEL: Final = pl.col("level").replace(
 
 
 def _name_kind(kind: str) -> str:
-    """Return the name of a kind of protection level in captions."""
+    """Return the name that captions use for a kind of protection level."""
     return "filter along the track" if kind == "train" else f"single epochs, {kind}"
 
 
@@ -193,7 +193,7 @@ def error_tables(evaluation: Evaluation) -> list[Table]:
     if evaluation.outages is not None and len(evaluation.outages):
         tables.append(outages(evaluation.outages))
     if (rows := evaluation.branches) is not None and len(rows):
-        caption = f"Stated probability of the position against the fraction of positions within {WRONG_PLACE_M:g} m"
+        caption = f"Stated branch probability, and fraction of positions within {WRONG_PLACE_M:g} m of the reference"
         tables.append(listing("branches", rows.with_columns(_OF), [*_where(rows), *_BRANCHES], caption))
     return tables
 
@@ -270,7 +270,7 @@ def _pool_runs(rows: pl.DataFrame) -> pl.DataFrame:
 
 
 def _together(rows: pl.DataFrame) -> pl.DataFrame:
-    """Return only the rows that combine both antennas if there are several runs, or all rows of a single run."""
+    """If there are several runs, return only the rows that combine both antennas; otherwise return all rows."""
     several = rows["run"].n_unique() > 1 and "all" in rows["antenna"]
     return rows.filter(antenna="all") if several else rows
 
@@ -314,7 +314,7 @@ def _group(grouping: str, rows: pl.DataFrame, caption: str) -> Table:
     both = both.filter(antenna="all") if "all" in both["antenna"] else both
     # epochs without satellites have no observations, so rates are fractions of all epochs
     counted, rate = ("epochs", "rate_of_run") if grouping == "signals" else ("observed", "rate")
-    of = "epochs and rate: of all epochs" if grouping == "signals" else "epochs and rate: of epochs with observations"
+    of = "epochs and rate: all epochs" if grouping == "signals" else "epochs and rate: only epochs with observations"
     columns: list[Column] = [*_where(both), ("group", "group", str), ("epochs", counted, count)]
     for conv, suffix in (("", ""), ("conv.\n", "_conventional")):
         columns += [(f"{conv}rate %", f"{rate}{suffix}", percent), (f"{conv}mean", f"mean_m{suffix}", signed)]
@@ -360,8 +360,8 @@ def _beyond(found: Integrity, kind: str, worst: int) -> Table:
     return listing(f"above-level-{kind}", shown, columns, caption)
 
 
-#: Largest number of epochs with an error above the protection level that are listed in ``evaluation.json``, the largest
-#: excess first. The CSV file has all these epochs.
+#: Maximum number of epochs with an error above the protection level in ``evaluation.json``, where they are in
+#: descending order of the excess. The CSV file has all these epochs.
 MOST_BEYOND: Final = 200
 
 

@@ -41,7 +41,7 @@ from railfix.reference.smoother import (
 from railfix.reference.wheel_distance import Wheel, estimate_wheel
 from railfix.track.trajectory import TRACK_AS_PATH, Trajectory
 
-#: Longest interval between two speeds over which they are integrated to a distance [s].
+#: Two successive speeds are integrated to a distance only if they are at most this time apart [s].
 LONGEST_STEP_S: Final = 2.5
 #: Variance of the distance travelled in an interval longer than `LONGEST_STEP_S` [m2].
 UNKNOWN_M2: Final = 1e8
@@ -89,13 +89,13 @@ def combine_speeds(time: Datetimes, sources: Sequence[Speeds]) -> tuple[Floats, 
         return np.where(weight > 0, total / weight, np.nan), np.where(weight > 0, weight**-0.5, np.nan)
 
 
-#: For each antenna, the speeds at the instants with a Doppler solution, and the solution at all instants.
+#: For each antenna: its speeds at the instants with a Doppler solution, and the Doppler solution of all instants.
 SolvedSpeeds = Mapping[str, tuple[Speeds, DopplerSpeed]]
 
 #: Number of rounds of Doppler solution and smoothing; the first round assumes a constant speed between fixes.
 _ROUNDS: Final = 3
-_MOVED: Final = 4.0  #: Fixes at least this number of sigmas apart show the direction of travel.
-_TELLING: Final = 2.0  #: Closing errors below this many standard deviations count as noise.
+_MOVED: Final = 4.0  #: Two fixes determine the direction of travel if they are more than this number of sigmas apart.
+_TELLING: Final = 2.0  #: Closing errors up to this number of standard deviations count as noise.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,7 +107,7 @@ class ReferenceData:
     dopplers: Mapping[str, Dopplers] = field(default_factory=dict)  #: Dopplers by antenna; may be empty.
     pulses: Pulses | None = None
     acceleration: Acceleration | None = None
-    facing: int = 1  #: 1 if the vehicle's front faces rising chainage, otherwise -1.
+    facing: int = 1  #: 1 if the vehicle's front faces rising chainage, -1 if it faces falling chainage.
     distance_m: float = float("nan")  #: Distance between the two antennas on the vehicle; NaN if unknown.
 
 

@@ -159,14 +159,14 @@ def antenna_record(part: Built) -> dict[str, Any]:
 
 SYSTEMS: Final = ("G", "J", "E", "C", "R")  #: Constellations whose Dopplers are used.
 _CHUNK: Final = 3000  #: Epochs of an observation log read at once.
-_NAMED: Final = 5  #: Largest number of gaps listed in the notes.
+_NAMED: Final = 5  #: The notes list at most this number of gaps.
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReferenceSummary:
     """Reference trajectories of a run, notes on them, and the written files."""
 
-    built: Mapping[str, Built]  #: Reference by antenna.
+    built: Mapping[str, Built]  #: Reference with its fixes and gaps, by antenna.
     notes: tuple[str, ...]
     files: Mapping[str, Path]  #: Paths by file name.
 

@@ -36,7 +36,7 @@ _TRAVEL_SHARE: Final = 0.005  #: Fraction of the distance travelled that is adde
 #: Fixes that disagree with their neighbours are rejected for at most twice this time [s]. If the disagreement lasts
 #: longer, the measured distance travelled is assumed to be wrong.
 _TRAVEL_HOLD_S: Final = 10.0
-_FIX_FLOOR_M: Final = 0.01  #: Lower bound of the standard deviation of a fix along the track.
+_FIX_FLOOR_M: Final = 0.01  #: Smaller standard deviations of a fix along the track are raised to this value [m].
 #: Standard deviation of the train's acceleration [m/s2] in the model of R. A. Singer (1970). Trains accelerate and
 #: brake by 0.5 to 1 m/s2 for some seconds.
 MOTION_MPS2: Final = 0.5
@@ -47,30 +47,29 @@ ACCELERATION_BIAS_MPS2: Final = 0.05  #: Standard deviation of the accelerometer
 class ReferenceSettings(Settings):
     """Limits and noise of a reference, which are recorded in ``reference.json``."""
 
-    #: Smallest ratio with which a fix passes the ambiguity test, if the log has ratios (RTKLIB's default is 3).
-    ratio: float = _limit("Smallest accepted ambiguity ratio, if the log has ratios.", 3.0, "RATIO", "--ratio")
-    #: Largest difference between the measured distance of the two antennas and their distance on the vehicle (P2 3.3: 5
-    #: cm).
+    #: Fixes with a smaller ratio of the ambiguity test are rejected, if the log has ratios (RTKLIB's default is 3).
+    ratio: float = _limit("Fixes with a smaller ambiguity ratio (if logged) are rejected.", 3.0, "RATIO", "--ratio")
+    #: Fixes are rejected if the antennas' distance differs from the vehicle's by more than this value (P2 3.3: 5 cm).
     spacing_m: float = _limit(
-        "Largest deviation of the distance between both antennas from its value on the vehicle.", 0.05, "M", "--spacing"
+        "Tolerance of the measured distance between the antennas; other fixes are rejected.", 0.05, "M", "--spacing"
     )
     #: Whether a fix of one antenna is rejected if the other antenna's log has no fix at that time.
     unpaired: Literal["reject", "keep"] = "reject"
-    #: Largest lateral distance from the antenna's trajectory; about three standard deviations of the map (P1 4.1(3)).
-    lateral_m: float = _limit("Largest lateral distance from the antenna's trajectory.", 1.0, "M", "--lateral")
-    #: Largest distance above or below the antenna's trajectory.
-    height_m: float = _limit("Largest distance above or below the antenna's trajectory.", 2.0, "M", "--height")
-    #: Limit of the difference between the distance of two fixes along the track and the measured distance travelled;
-    #: terms for distance and noise are added to this limit (P2 3.3).
+    #: Fixes farther beside the trajectory are rejected; the value is about three sigmas of the map (P1 4.1(3)).
+    lateral_m: float = _limit("Fixes farther beside the antenna's trajectory are rejected.", 1.0, "M", "--lateral")
+    #: Fixes farther above or below the antenna's trajectory are rejected.
+    height_m: float = _limit("Fixes farther above or below the antenna's path are rejected.", 2.0, "M", "--height")
+    #: Two fixes disagree if their distance along the track differs from the measured distance travelled by more than
+    #: this value plus terms for distance and noise (P2 3.3).
     travel_m: float = _positive(0.10)
     #: Largest speed of a train. Where the line passes a point several times, only the passes that the train can reach
     #: at this speed are considered.
     max_speed_mps: float = _positive(100.0)
-    #: Longest gap between good fixes that is bridged.
-    max_gap_s: float = _limit("Longest gap between good fixes that is bridged.", 60.0, "S", "--max-gap")
-    #: Largest standard deviation of the position at a bridged instant; less certain positions are omitted.
-    max_sigma_m: float = _limit("Largest standard deviation of a bridged position.", 1.0, "M", "--max-sigma")
-    #: Standard deviation of a fix along the track where the log has no standard deviation.
+    #: Gaps between good fixes are bridged up to this duration.
+    max_gap_s: float = _limit("Gaps between good fixes are bridged up to this duration.", 60.0, "S", "--max-gap")
+    #: Positions at bridged instants are omitted if their standard deviation exceeds this value.
+    max_sigma_m: float = _limit("Bridged positions with a larger sigma are omitted.", 1.0, "M", "--max-sigma")
+    #: Assumed standard deviation of a fix along the track, if the log states none.
     fix_sigma_m: float = _positive(0.03)
 
     doppler: DopplerSpeedLimits = Field(default_factory=DopplerSpeedLimits)
@@ -94,8 +93,8 @@ class ReferenceSettings(Settings):
 
 #: Positions of two antennas belong to one instant if their time tags differ by at most this [ns].
 _PAIR_NS: Final = 5_000_000
-_LOOK_BACK: Final = 60  #: Largest number of runs from one run to the next in the chain of runs (`_best_chain`).
-#: Number of standard deviations of a distance difference that are added to the limit `ReferenceSettings.travel_m`.
+_LOOK_BACK: Final = 60  #: `_best_chain` searches the predecessor of a run among this number of earlier runs.
+#: This number of standard deviations of the difference is added to the limit `ReferenceSettings.travel_m`.
 _TRAVEL_SIGMAS: Final = 3.0
 _FIX: Final = 1
 
@@ -127,16 +126,16 @@ class Fixes:
     time: Datetimes  #: GPS time, shape (n,).
     ecef_m: Floats  #: Position in ECEF, shape (n, 3).
     quality: Integers  #: Solution quality as in `PositionLog`, shape (n,).
-    ratio: Floats  #: Ratio of the ambiguity test, NaN where the log has none; shape (n,).
+    ratio: Floats  #: Ratio of the ambiguity test, shape (n,); NaN where the log states none.
     sigma_enu_m: Floats  #: Standard deviations east, north, up; NaN where the log has none; shape (n, 3).
     rejection: Bits  #: `FixRejection` bits; a row that fails a check is not checked further; shape (n,).
     #: Distance between the antennas minus their distance on the vehicle; NaN where not checked; shape (n,).
     spacing_m: Floats
-    arc_m: Floats  #: Arc length on the trajectory; NaN where not checked; shape (n,).
-    lateral_m: Floats  #: Offset to the right of the trajectory; NaN where not checked; shape (n,).
-    height_m: Floats  #: Upward offset from the trajectory; NaN where not checked; shape (n,).
-    sigma_m: Floats  #: Standard deviation along the track, shape (n,).
-    #: Distance from the previous good fix minus the distance travelled; NaN where it was not measured; shape (n,).
+    arc_m: Floats  #: Arc length of the nearest point of the trajectory, shape (n,); NaN where not checked.
+    lateral_m: Floats  #: Offset of the position to the right of the trajectory, shape (n,); NaN where not checked.
+    height_m: Floats  #: Height of the position above the trajectory, shape (n,); NaN where not checked.
+    sigma_m: Floats  #: Standard deviation of the position along the track, shape (n,).
+    #: Distance from the previous good fix minus the measured distance travelled, shape (n,); NaN without a measurement.
     travel_m: Floats
 
     def __len__(self) -> int:
@@ -210,11 +209,11 @@ def judge_pair(fixes: Fixes, other: Fixes, distance_m: float, settings: Referenc
     return replace(fixes, rejection=rejection, spacing_m=spacing)
 
 
-#: A row that was rejected for these reasons is still used to check positions of the other antenna.
+#: Rejection reasons of rows that are still used to check positions of the other antenna.
 _OF_THE_PAIR: Final = FixRejection.UNPAIRED | FixRejection.SPACING
 
 
-_OUT_OF_REACH_M = 1e6  #: Cost of a pass that the train cannot reach in time [m]; larger than all other costs.
+_OUT_OF_REACH_M = 1e6  #: Cost of a step to a pass that the train cannot reach in time [m]; it exceeds all other costs.
 _JITTER_M = 2.0  #: Tolerance for the jitter of positions, added to the distance that the train can travel [m].
 
 

@@ -23,20 +23,20 @@ from railfix.motion.singer import singer_steps
 from railfix.reference.fixes import ACCELERATION_BIAS_MPS2, MOTION_MPS2, MOTION_S, Fixes, ReferenceSettings
 from railfix.track.trajectory import Trajectory
 
-_ANY_SPEED_MPS: Final = 100.0  #: Standard deviation of an unknown initial speed [m/s].
-#: Standard deviation of an unknown initial position, and of an unknown difference between wheel distance and position
-#: [m].
+_ANY_SPEED_MPS: Final = 100.0  #: Standard deviation of the initial speed, which is unknown [m/s].
+#: Standard deviation of the initial position, and of the difference between wheel distance and position, both of which
+#: are unknown [m].
 _ANY_DISTANCE_M: Final = 1e4
 #: Doppler speeds with a residual above this number of standard deviations are down-weighted (P. J. Huber, 1964).
 _HUBER: Final = 2.0
 _ROUNDS: Final = 4  #: Number of rounds of smoothing and down-weighting.
-_SCALE_DRIFT: Final = 3e-6  #: Drift of the wheel's scale error [1 per square root of s].
-_OFFSET_DRIFT_MPS2: Final = 1e-3  #: Drift of the accelerometer's offset [m/s2 per square root of s].
-_LEAST_READING_M: Final = 1e-3  #: Smallest standard deviation of a wheel reading [m].
-_LEAST_STEP_M: Final = 1e-4  #: Smallest standard deviation of process noise over a step [m].
+_SCALE_DRIFT: Final = 3e-6  #: Random-walk density of the wheel's scale error [1 per square root of s].
+_OFFSET_DRIFT_MPS2: Final = 1e-3  #: Random-walk density of the accelerometer's offset [m/s2 per square root of s].
+_LEAST_READING_M: Final = 1e-3  #: Smaller standard deviations of a wheel reading are raised to this value [m].
+_LEAST_STEP_M: Final = 1e-4  #: Standard deviation that is added to the process noise of every step [m].
 
 
-SAME_INSTANT_NS: Final = 20_000_000  #: Time tags that differ by at most this belong to one instant [ns].
+SAME_INSTANT_NS: Final = 20_000_000  #: Time tags belong to one instant if they differ by at most this value [ns].
 
 
 def instants(rows: Datetimes, others: Sequence[Datetimes]) -> Datetimes:
@@ -57,14 +57,14 @@ def instants(rows: Datetimes, others: Sequence[Datetimes]) -> Datetimes:
 class Evidence:
     """Measurements along one antenna's path at N instants; NaN where missing."""
 
-    time: Datetimes  #: Times, increasing with steps of a few seconds at most; shape (N,).
+    time: Datetimes  #: Times of the instants, shape (N,); they increase by a few seconds at most.
     fix_m: Floats  #: Arc length of good fixes, shape (N,).
     fix_sigma_m: Floats  #: Standard deviation of `fix_m`, shape (N,).
     doppler_mps: Floats  #: Speed along the path from Dopplers, shape (N,).
     doppler_sigma_mps: Floats  #: Standard deviation of `doppler_mps`, shape (N,).
-    wheel_m: Floats  #: Cumulative wheel distance along rising chainage, from an arbitrary origin; shape (N,).
+    wheel_m: Floats  #: Cumulative wheel distance along rising chainage, from an arbitrary origin, shape (N,).
     wheel_sigma_m: float  #: Standard deviation of one reading of the wheel's distance.
-    acceleration_mps2: Floats  #: Mean acceleration along the path over each step, without gravity; shape (N - 1,).
+    acceleration_mps2: Floats  #: Mean acceleration along the path in each step, without gravity, shape (N - 1,).
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -304,7 +304,7 @@ def slip_m(misclosures: Closings, settings: ReferenceSettings) -> float:
     return float(np.sqrt(max(excess, _LEAST_SLIP_M**2)))
 
 
-WINDOWS: Final = 20  #: Smallest number of windows for an estimate.
+WINDOWS: Final = 20  #: A quantity is estimated only from at least this number of windows.
 #: 80th percentile of a squared standard normal variable.
 _CHI2_80: Final = 1.6424
 _LEAST_LASTING_MPS: Final = 1e-3
@@ -328,10 +328,10 @@ class Built:
     reference: AntennaReference
     fixes: Fixes  #: Every row of the position log with its reasons for rejection.
     gaps: tuple[Gap, ...]
-    #: Number of instants without a reference by reason: ``before_first_fix``, ``after_last_fix``, ``long_gap`` or
+    #: Number of instants that have no reference, by reason: ``before_first_fix``, ``after_last_fix``, ``long_gap`` or
     #: ``uncertain``.
     left_out: dict[str, int]
-    bridged_by: dict[str, int]  #: Number of bridged instants, by the combination of sensors that have measurements.
+    bridged_by: dict[str, int]  #: Number of bridged instants, by the sensors that have measurements there.
     facts: dict[str, Any]  #: Estimated and used parameters, as plain values.
 
 
@@ -416,5 +416,5 @@ def _name_bridges(evidence: Evidence, rows: Indices) -> dict[str, int]:
     return counts
 
 
-#: Largest time from a bridged instant to a measurement [ns]; it allows for a missing epoch of a 1 Hz sensor.
+#: A measurement at most this time away counts for a bridged instant [ns]; a 1 Hz sensor may lack an epoch.
 _NEAR_NS: Final = 1_500_000_000

@@ -13,10 +13,10 @@ from railfix.core.timescale import seconds
 from railfix.io.reference_log import Pulses
 
 _WINDOW_S: Final = 10.0  #: Length of a window for the estimate of the distance per pulse [s].
-_LEAST_DISTANCE_M: Final = 30.0  #: Smallest distance travelled in a window that is used [m].
-_LEAST_WINDOWS: Final = 5  #: Smallest number of windows for an estimate.
-_DIRECTION_MPS: Final = 0.3  #: Lowest speed that determines a direction [m/s].
-_FASTEST_MPS: Final = 150.0  #: Highest plausible speed [m/s].
+_LEAST_DISTANCE_M: Final = 30.0  #: A window is used only if the train travels at least this distance in it [m].
+_LEAST_WINDOWS: Final = 5  #: The distance per pulse is estimated only from at least this number of windows.
+_DIRECTION_MPS: Final = 0.3  #: The sign of a speed determines the direction only if the speed exceeds this value [m/s].
+_FASTEST_MPS: Final = 150.0  #: Pulses that imply a higher speed are an error [m/s].
 
 
 @dataclass(frozen=True, kw_only=True)

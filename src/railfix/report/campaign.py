@@ -23,16 +23,16 @@ from railfix.report.explain import explain_epoch, time_text, write_explanation
 from railfix.report.plots.campaign import campaign_bars, campaign_plan
 from railfix.report.plots.chart import Chart
 
-#: Maximum number of worst epochs that are listed.
+#: At most this number of worst epochs is listed.
 _WORST: Final = 10
-#: At most one epoch of a run is listed in each interval of this length [s].
+#: Of the worst epochs, at most one per run is listed in each interval of this length [s].
 _EVENT_S: Final = 60
 #: Number of pieces into which the line of each run is divided for the charts.
 _PIECES: Final = 400
 #: Maximum number of runs in a chart with one bar per run. The runs with the largest values are drawn; the table has all
 #: runs.
 _BARS: Final = 40
-#: Quantities that can select the worst epochs; the first quantity that has values is used.
+#: Quantities whose largest values determine the worst epochs; the first quantity that has values is used.
 _QUANTITIES: Final = ("error_m", "protection_level_m", "along_sigma_m")
 _FIGURES: Final[Sequence[Column]] = (
     ("epochs", "epochs", count),

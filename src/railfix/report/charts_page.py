@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from railfix.track.network_read import NetworkQuality
 
 _EPOCH_ZERO: Final = np.datetime64("1970-01-01T00:00:00", "ns")
-#: Unsigned 16-bit number that represents an unknown C/N0.
+#: 16-bit number that stands for an unknown C/N0.
 _UNKNOWN: Final = 65535
 _OF_CHART: Final = (
     "title", "x_label", "y_label", "x_scale", "y_scale", "y_linear", "x_range", "y_range", "equal",
@@ -224,10 +224,10 @@ class Figure:
     number: int  #: Number of the figure in the page, beginning with 0.
     chart: Chart | SkyEpochs
     json: Markup  #: Values of the chart for the script of the page.
-    width: str  #: Style class of the width: "wide" or "half".
-    sky: str  #: Element id of the sky plot that shows the epoch of a clicked point; "" if there is no sky plot.
+    width: str  #: Name of the style class for the width: "wide" or "half".
+    sky: str  #: Element id of the sky plot that shows the epoch of a clicked point; "" without a sky plot.
     zoomed_with: str  #: Figures with the same value share the range of the x axis; "" if the range is not shared.
-    linked: str  #: Figures with the same value show the same epochs after a zoom; "" for a figure that is not linked.
+    linked: str  #: Figures with the same value show the same epochs after a zoom; "" if no figure is linked.
 
     @property
     def is_sky(self) -> bool:

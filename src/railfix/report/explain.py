@@ -61,8 +61,8 @@ FILTER_STATUS: Final[Mapping[str, str]] = {
     "doubtful": "measurements contradict the position or its bound: the error is not bounded",
     "spoofing_suspected": "the signals may come from a spoofer: the error is not bounded",
 }
-#: Columns of `Explanation.satellites` with the effect of omitting the satellite: the shift of the position and the
-#: sigma of the shifted position.
+#: Columns of `Explanation.satellites` with the effect of omitting the satellite: shift of the position, and sigma of
+#: the position without the satellite.
 WITHOUT: Final = ("without_shift_m", "without_sigma_m")
 _COLUMNS: Final = (
     "satellite", "signal", "elevation_deg", "azimuth_deg", "cn0_dbhz", "sigma_m", "residual_m", "reason_text",
@@ -70,7 +70,7 @@ _COLUMNS: Final = (
 )  # fmt: skip
 
 
-#: Number of epochs that are shown before the explained epoch, and number of epochs shown after it.
+#: This number of epochs is shown before, and after, the explained epoch.
 _AROUND: Final = 5
 #: Columns of ``positions`` and ``train`` that are shown for the epochs before and after the explained epoch.
 _NEIGHBOURS: Final = ("chainage_m", "along_sigma_m", "protection_level_m", "status")
@@ -80,11 +80,11 @@ _NEIGHBOURS: Final = ("chainage_m", "along_sigma_m", "protection_level_m", "stat
 class Explanation:
     """Explanation of one epoch of one antenna."""
 
-    run: Path  #: Results folder.
+    run: Path  #: Folder of the run.
     antenna: str
     time: np.datetime64  #: GPS time of the epoch.
     asked: str  #: Requested time, as the user gave it.
-    #: Rows of the epoch in ``positions`` and ``train``; `track` is empty if the filter was off.
+    #: Row of the epoch in ``positions`` (`single`) and in ``train`` (`track`); `track` is empty if the filter was off.
     single: Mapping[str, Any]
     track: Mapping[str, Any]
     #: One row per observation, used observations first, with elevation, residual, outcome, and weight and innovation in
@@ -92,8 +92,8 @@ class Explanation:
     #: its shift along the line and its standard deviation [m]; null if there is no such position.
     satellites: pl.DataFrame
     sentences: tuple[str, ...]  #: Sentences on position, sigma, protection level and status.
-    #: Epochs before and after the explained epoch: columns `_NEIGHBOURS` of ``positions``, and of ``train`` with the
-    #: prefix ``filter_``.
+    #: Epochs before and after the explained epoch: columns `_NEIGHBOURS` of ``positions``, and (with the prefix
+    #: ``filter_``) of ``train``.
     neighbours: pl.DataFrame
 
 

@@ -33,7 +33,7 @@ from railfix.report.plots.screens import list_screens, missing_columns, screen_o
 from railfix.report.plots.signals import CN0_COLUMNS, SKY_COLUMNS, SKY_EPOCHS, cn0_over_elevation, sky_epochs
 from railfix.report.runs import ReportedRun
 
-#: Maximum number of listed epochs with an error above the protection level.
+#: At most this number of epochs with an error above the protection level is listed.
 WORST: Final = 20
 NO_LEVELS: Final = "The run has no protection levels (protection is off)."
 _KINDS: Final = {

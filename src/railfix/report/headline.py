@@ -25,7 +25,7 @@ class KeyFigure:
     name: str
     value: str  #: Value for single-epoch positions.
     filtered: str = ""  #: Value for the filter along the track; "" if the filter was off.
-    beside: str = ""  #: Value for conventional positions, or a remark.
+    beside: str = ""  #: Value for conventional positions, or a remark on the figure.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +34,7 @@ class Headline:
 
     verdict: str  #: Sentences on availability and accuracy.
     figures: tuple[KeyFigure, ...]
-    compared: str  #: Definitions of the positions that the figures describe.
+    compared: str  #: Definitions of the kinds of position that the figures compare.
     remarks: tuple[str, ...]  #: Sentences on the longest outage, large errors, and failed checks.
 
 

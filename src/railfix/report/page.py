@@ -37,7 +37,7 @@ from railfix.report.plots.signals import SKY_EPOCHS
 from railfix.report.runs import ReportedRun, get_figures, read_runs
 from railfix.run.record import budget_tables, level_basis
 
-#: Errors in the table of all runs: the kind of position and the table of positions, by the name in the header.
+#: Errors in the table of all runs: kind of position and table of positions, by name in the header.
 _JUDGED: Final = {
     "filter": ("constrained", "train"),
     "single epochs": ("constrained_ok", POSITIONS_TABLE),
@@ -187,7 +187,7 @@ def _word(value: Any) -> str:
     return "none" if value is None else str(value)
 
 
-#: Smallest number of epochs in the sky plot of an antenna, however many antennas the page has.
+#: The sky plot of an antenna has at least this number of epochs, however many antennas the page has.
 _LEAST_SKY: Final = 200
 
 

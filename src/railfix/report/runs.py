@@ -31,15 +31,15 @@ from railfix.track import Track
 
 _OBSERVATIONS: Final = "observations.parquet"
 _NEEDED: Final = {"time_gpst", "antenna", "satellite", "signal", "reason", "elevation_deg", "azimuth_deg", "cn0_dbhz"}
-#: Columns of the positions that the report reads in addition to the usual columns.
+#: Columns of the table ``positions`` that the report reads in addition to the required columns.
 _POSITIONS: Final = cs.contains("protection_level", "protection_status", "protection_cause", "_fault") | cs.by_name(
     "kilometrage_m", "n_rejected", "raim_statistic", "raim_threshold", "raim_level_m", "protection_kind",
     *(column.name for screen in SCREENS for column in screen.columns if column.table == "positions"),
     require_all=False,
 )  # fmt: skip
-#: Columns of the filter that the report reads.
+#: Columns of the table ``train`` (filter) that the report reads.
 _TRAIN: Final = ("time_gpst", "antenna", "x_m", "y_m", "z_m", "along_sigma_m")
-#: Columns of the errors that the report reads.
+#: Columns of the table of errors that the report reads.
 _ERRORS: Final = (
     "time_gpst", "antenna", "status", "observed", "in_reference", "reference_good", "chainage_m", "environment",
     "n_used", "positioned", "conventional_positioned", "error_m", "conventional_error_m", "along_sigma_m",
@@ -53,7 +53,7 @@ class ReportedRun:
 
     name: str  #: Name of the folder, with as many parent folders as needed to distinguish the runs.
     folder: RunFolder
-    config: Config  #: Settings that were used.
+    config: Config  #: Settings that the run used.
     observations: pl.LazyFrame | None  #: Table of observations; None if the run wrote none.
     #: Errors and protection levels per epoch (columns of `railfix.evaluate.EPOCH_COLUMNS`): `errors` of the
     #: single-epoch positions, `filtered` of the filter along the track. Both are None without a reference; `filtered`
@@ -62,10 +62,10 @@ class ReportedRun:
     filtered: pl.DataFrame | None
     train: pl.DataFrame | None  #: Times, positions and sigmas of the filter along the track; None if it was off.
     reference: str  #: Path of the reference; "" if there is none.
-    conventional: Path | None  #: Run whose conventional positions are shown; None for the run itself.
+    conventional: Path | None  #: Folder of another run whose conventional positions are shown; None for its own.
     track: Track | None  #: Track of the run; None if its files cannot be read.
-    curve: Cn0Curve | None  #: C/N0 curve that the run used; None if it used none, or if it cannot be read.
-    notes: tuple[str, ...]  #: Notes in addition to the notes of the run.
+    curve: Cn0Curve | None  #: C/N0 curve of the run; None if the run used no curve, or the curve cannot be read.
+    notes: tuple[str, ...]  #: Notes of the report on the run, in addition to the notes of the run itself.
 
     def name_in(self, evaluation: Evaluation, table: str = POSITIONS_TABLE) -> str:
         """Return the name of a position table of this run in an evaluation; "" if the evaluation lacks the table."""

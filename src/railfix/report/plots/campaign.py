@@ -32,7 +32,7 @@ from railfix.report.plots.line import ECEF, ERROR_CLASSES, LEVEL_CLASSES, LocalF
 if TYPE_CHECKING:
     import polars as pl
 
-#: Name of each quantity, limits of its classes [m], and colour of its bars, by column name.
+#: By column name: name of the quantity, limits of its classes [m], and colour of its bars.
 _QUANTITIES = {
     "error_m": ("error", ERROR_CLASSES, CONSTRAINED),
     "protection_level_m": ("level", LEVEL_CLASSES, FILTERED),

@@ -25,7 +25,7 @@ GREEN: Final[str] = "#00805e"
 PURPLE: Final[str] = "#a3487e"
 BLACK: Final[str] = "#000000"
 GREY: Final[str] = "#767676"
-#: Colours of positions on the map, of the filter along the track, and of conventional positions in all charts.
+#: Colours in all charts: positions computed with the map, filter along the track, and conventional positions.
 CONSTRAINED: Final[str] = BLUE
 FILTERED: Final[str] = GREEN
 CONVENTIONAL: Final[str] = RED
@@ -58,12 +58,12 @@ class Points(_Layer):
 
     kind: ClassVar[str] = "points"
     shape: Shape = "dot"
-    size: float = 3.0  #: Width of a point in pixels of a page.
+    size: float = 3.0  #: Width of a point on a page [pixels].
     #: Coordinates, shape (P,); points with NaN are not drawn.
     x: Floats
     y: Floats
 
-    #: Time of each point since the start of the group [s], shape (P,); a click on a point shows the sky at this time.
+    #: Time of each point [s], as in the sky plot, shape (P,); a click on a point shows the sky at its time.
     epoch_s: Floats | None = None
 
 
@@ -103,7 +103,7 @@ class Cells(_Layer):
     """Numbers of points in the A x B cells of a grid; darker cells have more points."""
 
     kind: ClassVar[str] = "cells"
-    #: Edges of the cells, shapes (A + 1,) and (B + 1,).
+    #: Edges of the cells along x and y, shapes (A + 1,) and (B + 1,).
     x_edges: Floats
     y_edges: Floats
     counts: Integers  #: Number of points in each cell, shape (A, B).
@@ -119,7 +119,7 @@ class RangeBars(_Layer):
 
     kind: ClassVar[str] = "ranges"
     names: tuple[str, ...]
-    #: Ends and mark of each bar, shape (N,); bars with NaN are not drawn.
+    #: Lower end, mark and upper end of each bar, shape (N,); bars with NaN are not drawn.
     low: Floats
     mid: Floats
     high: Floats
@@ -133,7 +133,7 @@ class Marks(_Layer):
     #: Coordinates of the texts, shape (P,).
     x: Floats
     y: Floats
-    words: tuple[str, ...]  #: Text at each point; the lines of a text are separated by line feeds.
+    words: tuple[str, ...]  #: Text at each point; a line feed begins a new line of the text.
     #: Position of the text: "beside" a cross at the point, or centred "on" the point without a cross.
     place: Literal["beside", "on"] = "beside"
 
@@ -145,7 +145,7 @@ Layer = Points | Curve | Band | Bars | Cells | RangeBars | Marks
 class Chart:
     """Chart with two axes."""
 
-    name: str  #: Short name for files and page elements, such as ``error-time``.
+    name: str  #: Short name of the chart for files and page elements, such as ``error-time``.
     title: str
     caption: str  #: Explanation of the chart, with the number of omitted points.
 
@@ -155,12 +155,12 @@ class Chart:
     start: np.datetime64 | None = None  #: GPS time at which `x` is 0; None if the x axis is not time.
     x_scale: Scale = "linear"
     y_scale: Scale = "linear"
-    y_linear: float = 1.0  #: Absolute value up to which a symlog y axis is linear.
-    #: Range of each axis; None for the range of the data.
+    y_linear: float = 1.0  #: A symlog y axis is linear up to this absolute value.
+    #: Range of each axis; None if the data determine it.
     x_range: tuple[float, float] | None = None
     y_range: tuple[float, float] | None = None
     equal: bool = False  #: Whether the axes are east and north with equal scales; an arrow to the north is then drawn.
-    width: Literal["wide", "half"] = "wide"  #: Width in a page.
+    width: Literal["wide", "half"] = "wide"  #: Width of the chart in a page.
 
     @property
     def common_axis(self) -> Literal["time", "chainage", ""]:
@@ -184,11 +184,11 @@ class SkyEpochs:
     caption: str
     start: np.datetime64  #: GPS time from which `epoch_s` counts.
     epoch_s: Floats  #: Times of the epochs in ascending order [s], shape (K,).
-    first: Integers  #: Index of the first row of each epoch, and R as the last value; shape (K + 1,).
+    first: Integers  #: Index of the first row of each epoch; the last value is R; shape (K + 1,).
     #: Satellite and signal of each row, shape (R,).
     satellite: Strings
     signal: Strings
-    #: Direction and C/N0 of each row, shape (R,); NaN for an unknown C/N0.
+    #: Direction and C/N0 of the satellite of each row, shape (R,); NaN if the C/N0 is unknown.
     azimuth_deg: Floats
     elevation_deg: Floats
     cn0_dbhz: Floats

@@ -48,7 +48,7 @@ from railfix.report.plots.chart import (
 
 _ERROR_LABEL: Final = "error along the line [m]"
 _SIGN: Final = "Positive errors are toward the end of the line."
-#: Number of pieces of the x axis; the largest sigma and the largest protection level of each piece are drawn.
+#: The x axis is divided into this number of pieces; the largest sigma and protection level of each piece are drawn.
 _PIECES: Final = 600
 _SERIES: Final = (
     ("conventional", "conventional_error_m", CONVENTIONAL, "square"),
@@ -232,7 +232,7 @@ def errors_of_runs(runs: Mapping[str, pl.DataFrame]) -> Chart:
     )
 
 
-#: Labels and columns of the parts of the protection level, of the RAIM level, and of the protection level itself.
+#: Label and column of each part of the protection level, of the RAIM level, and of the protection level itself.
 _PARTS: Final = (
     ("fault-free part", "protection_fault_free_m"),
     ("one-fault part", "protection_one_fault_m"),
@@ -242,8 +242,8 @@ _PARTS: Final = (
 )
 
 
-#: Region, text, x and y of each label of the Stanford diagram; x and y are 1 at the alarm limit, and 2 at the end of
-#: the axis.
+#: Labels of the Stanford diagram: region, text, x and y of the label; x and y are 1 at the alarm limit, and 2 at the
+#: end of the axis.
 _REGIONS: Final = (
     (Region.NOMINAL, "nominal", 0.35, 0.78),
     (Region.MISLEADING, "misleading", 0.7, 0.24),

@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 _DRAWN: Final = 200_000
 #: Maximum number of tracks that are named in the plan.
 _NAMED: Final = 400
-#: Margin of the view around a run, as a fraction of the larger extent of the run; minimum margin [m]; and distance of a
+#: Margin of the view around a run, as a fraction of the larger extent of the run; minimum margin [m]; distance of a
 #: track name from the track, as a fraction of the extent of the view.
 _MARGIN, _LEAST_VIEW_M, _BESIDE = 0.12, 100.0, 0.03
 _KINDS: Final = {"gap": RED, "joint": RED, "kink": "#e08e0b", "too near": "#7b3294", "dead end": GREY}
-#: Classes of matched positions: smallest track probability of the class, and colour.
+#: Classes of matched positions: lower limit of the track probability, and colour.
 _CLASSES: Final = ((0.99, ORDERED[0]), (0.9, ORDERED[1]), (0.5, ORDERED[3]), (0.0, ORDERED[4]))
 
 
@@ -161,7 +161,7 @@ def _positions(frame: LocalFrame, log: PlanLog, matched: Matched) -> list[Layer]
 
 _COLOURS: Final = {"error": "#c1272d", "warning": "#e08e0b"}
 _LINE: Final = "#1f4e79"
-#: Panel in which each kind of finding is marked; other kinds are marked only in the plan.
+#: Panel in which findings of each kind are marked; findings of other kinds are marked only in the plan.
 _PANELS: Final = {
     "mid-chord": "mid-chord",
     "duplicate": "spacing",

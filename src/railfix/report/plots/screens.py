@@ -253,8 +253,8 @@ class RunScreen:
     """Result of one screen of a run for one antenna."""
 
     antenna: str  #: ``front`` or ``rear``.
-    name: str  #: Name of the picture, such as ``doppler``.
-    picture: ScreenPicture  #: Metric and limit, with one row per epoch or per observation.
+    name: str  #: Name of the plot of the screen, such as ``doppler``.
+    picture: ScreenPicture  #: Metric and limit of the screen, with T rows (epochs or observations).
     epoch: NDArray[np.int32] | None  #: Index of the epoch of each row, shape (T,); None if the rows are the epochs.
     epoch_time: Datetimes  #: Time of each epoch, shape (E,).
     epoch_chainage_m: Floats  #: Chainage of the position of each epoch, shape (E,); NaN without a position.

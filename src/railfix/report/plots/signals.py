@@ -31,10 +31,10 @@ from railfix.report.plots.chart import (
 )
 from railfix.screens import Cn0Limits
 
-#: Edges of the cells in which samples are counted: elevation [deg] and C/N0 [dB-Hz].
+#: Edges of the cells of elevation [deg] and C/N0 [dB-Hz] in which samples are counted.
 _ELEVATION_EDGES: Final = np.arange(0.0, 91.0, 1.0)
 _CN0_EDGES: Final = np.arange(10.0, 60.5, 0.5)
-#: The mean is drawn for intervals of elevation with at least this number of samples.
+#: The mean C/N0 is drawn for intervals of elevation that have at least this number of samples.
 _LEAST: Final = 10
 #: Maximum number of epochs of a sky plot.
 SKY_EPOCHS: Final = 2000
