@@ -42,11 +42,7 @@ def _read_gpx(path: FilePath) -> PositionLog:
     except ValueError:
         raise InputFileError(path, "a time is not in the form 2024-01-01T10:00:00Z (UTC)") from None
     known = np.isfinite(points[:, 2])
-    notes = (
-        [f"{path}: GPX heights above the geoid are used as ellipsoidal heights"]
-        if (known & np.isnan(geoid)).any()
-        else []
-    )
+    notes = [f"{path}: GPX heights above the geoid are taken as ellipsoidal"] if (known & np.isnan(geoid)).any() else []
     if not known.all():
         notes.append(f"{path}: {int((~known).sum()):,} of {len(points):,} points have no height (ele)")
     return PositionLog(
@@ -154,9 +150,7 @@ def read_positions(
     check_path(path)
     kind = find_kind(path)
     if columns and kind != "table":
-        raise SettingsError(
-            f"{path}: only a table with named columns can have columns renamed; leave out columns (--column)"
-        )
+        raise SettingsError(f"{path}: only the columns of a table with names can be renamed; leave out --column")
     parsers: dict[FileKind, Callable[[list[str]], PositionLog]] = {
         "table": lambda lines: parse_csv_positions(lines, path, columns or {}),
         "novatel": lambda lines: _parse_novatel(lines, path),

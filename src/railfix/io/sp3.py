@@ -48,9 +48,7 @@ def read_sp3(paths: Paths) -> PreciseEphemeris:
     times, row = np.unique(np.array(epoch, dtype=np.int64), return_inverse=True)
     satellites, column = np.unique(np.array(satellite, dtype="<U3"), return_inverse=True)
     if len(times) < POINTS:
-        raise InputFileError(
-            source, f"has {len(times)} epochs, but the interpolation of orbits needs at least {POINTS}"
-        )
+        raise InputFileError(source, f"has {len(times)} epochs, but interpolation of orbits needs at least {POINTS}")
     grid = np.full((len(times), len(satellites), 4), np.nan)
     # Assigned in reverse order, so that the first of several values is kept.
     grid[row[::-1], column[::-1]] = np.array(numbers)[::-1]

@@ -83,8 +83,7 @@ def read_kml_lines(path: FilePath) -> list[XmlLine]:
             mode = _texts(part).get("altitudeMode", "")
             if mode.startswith("relativeTo"):
                 raise InputFileError(
-                    path,
-                    f"its altitudeMode is {mode}, which gives no track height; write absolute heights or no heights",
+                    path, f"its altitudeMode is {mode}, which gives no track height; write absolute or no heights"
                 )
             rows = [_numbers(path, f"a coordinate of {name!r}", cells) for cells in _kml_cells(part)]
             if not rows:

@@ -275,9 +275,7 @@ class _Answer:
             request = self._h11.Request(method="GET", target=parts.path, headers=head)
             return bytes(self._client.send(request) + self._client.send(self._h11.EndOfMessage()))
         except self._h11.LocalProtocolError as error:
-            raise SettingsError(
-                f"source {hidden(self._source)!r}: no valid request can be made from it ({error})"
-            ) from None
+            raise SettingsError(f"source {hidden(self._source)!r}: gives no valid NTRIP request ({error})") from None
 
     def take(self, data: bytes) -> bytes:
         """Return the content decoded from further bytes of the answer; raise InputFileError if the content is not a

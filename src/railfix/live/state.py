@@ -133,9 +133,7 @@ def load_state(path: Path, under: Mapping[str, Any]) -> Loaded:
         return _refuse(path, f"contains no state ({error})")
     if not isinstance(session, SavedSession):
         return _refuse(path, "contains no state")
-    return Loaded(
-        session=session, outcome=f"state file {path}: used, because it agrees with this map, vehicle and settings"
-    )
+    return Loaded(session=session, outcome=f"state file {path}: used; it agrees with this map, vehicle and settings")
 
 
 def _part(path: Path) -> Path:

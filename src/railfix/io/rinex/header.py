@@ -107,9 +107,7 @@ def read_version(path: FilePath, line: str) -> float:
     except ValueError as error:
         raise InputFileError(path, f"RINEX version '{line[:9].strip()}' is not a number", line=1) from error
     if not 2.0 <= version < 5.0:
-        message = (
-            f"RINEX version {version:.2f} is not supported; 2.10 to 2.12, 3.00 to 3.05 or 4.00 to 4.02 was expected"
-        )
+        message = f"RINEX version {version:.2f} is not supported; expected 2.10 to 2.12, 3.00 to 3.05 or 4.00 to 4.02"
         raise InputFileError(path, message, line=1)
     return version
 

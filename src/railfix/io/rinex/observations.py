@@ -146,9 +146,7 @@ class BlockReader:
                 what = f"a header of RINEX {further.version:g} begins here, but the file has RINEX {header.version:g}"
                 raise InputFileError(self.path, f"{what}; divide the file at this line", line=number)
             if further.reading != header.reading:
-                self._log.remark(
-                    f"{self.path}, line {number}: another header begins here; it applies to the epochs after it"
-                )
+                self._log.remark(f"{self.path}, line {number}: another header begins here, for the epochs after it")
             return further
         return apply_records(self.path, header, records, first_line=number, log=self._log)
 
