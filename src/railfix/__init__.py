@@ -22,9 +22,9 @@ The files are from a simulated run. The median error of these positions is 0.34 
 ============================ =========================================================================
 read                         `read_observations`, `read_navigation`, `read_track`, `read_vehicle`,
                              `read_sbas`, `read_sp3`, `read_positions`, `read_reference`
-position in Python           `EpochProcessor` with a `Config` and `Trajectory` objects
+compute positions in Python  `EpochProcessor` with a `Config` and `Trajectory` objects
                              (`antenna_trajectory`); returns a `Result`
-position files               `run_files` with `RunInputs`
+compute positions from files `run_files` with `RunInputs`
 single stages                `ranges.find_satellites`, `ranges.corrected_ranges`, the screens of `screens`,
                              `positioning.find_section`, `positioning.position_on_line`,
                              `integrity.exclude_faults`, `integrity.protection_level`

@@ -303,7 +303,7 @@ def test_every_card_has_the_figure_of_the_evaluation_and_of_the_verdict(folder: 
         runs, evaluation = read_runs([mine], [demo_truth()], conventional=[tmp_path / "unscreened"])
         assert evaluation is not None
         page = report_page(runs, evaluation)
-        assert "unscreened ranges, as in P1" in page
+        assert "unscreened ranges, as in paper P1" in page
         cards = cards_of(page)
         assert len(cards) == 5
         name, train = (runs[0].name_in(evaluation, table) for table in ("positions", "train"))

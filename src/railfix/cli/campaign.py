@@ -53,7 +53,7 @@ def campaign(
         typer.Option(
             "--scheduler",
             metavar="ADDRESS",
-            help="Dask scheduler, tcp://HOST:PORT, whose workers have access to the same files (with extra `cluster`).",
+            help="Dask scheduler, tcp://HOST:PORT (extra `cluster`); its workers need access to the same files.",
         ),
     ] = None,
     as_json: JsonOption = False,

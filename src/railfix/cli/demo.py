@@ -52,8 +52,9 @@ def demo(
 
     With `--real`, the log is a 20-minute drive of a car through a town, from the Python package `gnss-benchmark` (MIT
     licence), which pip downloads and the user's cache keeps. The map is made from the ground truth: a trajectory
-    computed with RTKLIB if it is installed, otherwise the publisher's trajectory. As with `railfix benchmark`, railfix
-    and RTKLIB are evaluated; the case is written into `DIR/drive`, and the results into `DIR/benchmark`.
+    computed with RTKLIB if it is installed, otherwise the publisher's trajectory. As with `railfix benchmark`, the
+    positions of railfix and RTKLIB are evaluated; the case is written into `DIR/drive`, and the results into
+    `DIR/benchmark`.
 
     Example: `railfix demo --out first-look`
 

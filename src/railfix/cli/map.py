@@ -60,7 +60,7 @@ def check(
         float, typer.Option(metavar="M", help="Gaps between the ends of two segments are bridged up to this length.")
     ] = 1.0,
     mid_chord: Annotated[
-        float, typer.Option(metavar="M", help="Largest accepted mid-chord deviation from the arc.")
+        float, typer.Option(metavar="M", help="A larger mid-chord deviation from the arc is a fault.")
     ] = 0.30,
     overwrite: OverwriteOption = False,
 ) -> None:

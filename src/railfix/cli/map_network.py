@@ -30,7 +30,7 @@ from railfix.track.read import track_of_segments
 
 Maps = Annotated[list[Path], typer.Argument(metavar="MAP...", help="Map files; all their tracks form the network.")]
 
-#: Names of those options for reading a track that only `railfix run` has.
+#: Names of the track-reading options that only `railfix run` has.
 RUN_ALONE = ("reference", "cache")
 #: Options for reading a map in a command that processes no run.
 MapReading = Annotated[TrackReading, Without(*RUN_ALONE, "map_epoch", "plate", "jgd_parameters", "height_sigma")]

@@ -87,9 +87,10 @@ def service(
         verdict.append("the runs have no filter and no protection levels; fractions refer to single-epoch positions")
     show_verdict(console, verdict)
     caption = (
-        f"Stretches of {stretch:g} m by first chainage. Satellites and protection levels (level): median and a "
-        "percentile over the epochs. 3-D: distance of the 3-D position from the line. Filter: fraction of epochs "
-        "with a protection level. Served: fraction of epochs with a protection level within the limit"
+        f"Stretches of {stretch:g} m, with the chainage of their start. Satellites: median and 5th percentile over "
+        "the epochs. Level (protection level): median and 95th percentile. 3-D: 95th percentile of the distance of "
+        "the 3-D position from the line. Filter: fraction of epochs with a protection level. Served: fraction of "
+        "epochs with a protection level within the limit"
     )
     table = listing("service", found, _COLUMNS, caption)
     show_table(console, table)

@@ -60,7 +60,8 @@ CLEAR_M: Final = 200.0
 #: A point counts as lying on a tangent if its distance from the tangent is at most this value [m].
 ON_TANGENT_M: Final = 1e-3
 
-#: Prior probability of a joint fault of the low satellites on one side of the track: upper 95 % confidence bound of the
-#: fraction of time in 70 simulated hours in a city, with faults in a part of 2 of 30 943 blocks of 30 s
-#: (docs/level-results.md). Real recordings are shorter, and support only an upper bound of 1e-2.
+#: Prior probability of a joint fault of the low satellites on one side of the track: the upper 95 % confidence bound of
+#: the fraction of time with such a fault. In 70 simulated hours in a city, 2 of 30 943 blocks of 30 s had such a fault,
+#: for a part of the block (docs/level-results.md). Real recordings are shorter, and support only an upper bound of
+#: 1e-2.
 SUPPORTED_SIDE_PRIOR: Final = 1.3e-5

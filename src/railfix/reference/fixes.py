@@ -55,15 +55,16 @@ class ReferenceSettings(Settings):
     )
     #: Whether a fix of one antenna is rejected if the other antenna's log has no fix at that time.
     unpaired: Literal["reject", "keep"] = "reject"
-    #: Fixes farther beside the trajectory are rejected; the value is about three sigmas of the map (P1 4.1(3)).
-    lateral_m: float = _limit("Fixes farther beside the antenna's trajectory are rejected.", 1.0, "M", "--lateral")
-    #: Fixes farther above or below the antenna's trajectory are rejected.
+    #: Fixes at a larger lateral distance from the antenna's trajectory are rejected. The value is about three standard
+    #: deviations of the map (P1 4.1(3)).
+    lateral_m: float = _limit("Fixes at a larger lateral distance from the path are rejected.", 1.0, "M", "--lateral")
+    #: Fixes at a larger distance above or below the antenna's trajectory are rejected.
     height_m: float = _limit("Fixes farther above or below the antenna's path are rejected.", 2.0, "M", "--height")
     #: Two fixes disagree if their distance along the track differs from the measured distance travelled by more than
     #: this value plus terms for distance and noise (P2 3.3).
     travel_m: float = _positive(0.10)
-    #: Largest speed of a train. Where the line passes a point several times, only the passes that the train can reach
-    #: at this speed are considered.
+    #: Where the line passes a point several times, only those passes are considered that the train can reach without
+    #: exceeding this speed.
     max_speed_mps: float = _positive(100.0)
     #: Gaps between good fixes are bridged up to this duration.
     max_gap_s: float = _limit("Gaps between good fixes are bridged up to this duration.", 60.0, "S", "--max-gap")
@@ -91,9 +92,10 @@ class ReferenceSettings(Settings):
     acceleration_mps2: float = _positive(0.02)
 
 
-#: Positions of two antennas belong to one instant if their time tags differ by at most this [ns].
+#: Positions of two antennas belong to one instant if their time tags differ by at most this value [ns].
 _PAIR_NS: Final = 5_000_000
-_LOOK_BACK: Final = 60  #: `_best_chain` searches the predecessor of a run among this number of earlier runs.
+#: Number of earlier sequences of agreeing fixes that `_best_chain` considers as predecessors of a sequence.
+_LOOK_BACK: Final = 60
 #: This number of standard deviations of the difference is added to the limit `ReferenceSettings.travel_m`.
 _TRAVEL_SIGMAS: Final = 3.0
 _FIX: Final = 1

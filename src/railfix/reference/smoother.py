@@ -416,5 +416,6 @@ def _name_bridges(evidence: Evidence, rows: Indices) -> dict[str, int]:
     return counts
 
 
-#: A measurement at most this time away counts for a bridged instant [ns]; a 1 Hz sensor may lack an epoch.
+#: A measurement counts for a bridged instant if it is at most this time away [ns]; the value allows for one missing
+#: epoch of a 1 Hz sensor.
 _NEAR_NS: Final = 1_500_000_000

@@ -81,7 +81,7 @@ def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, passed:
         )
         for name, text in texts.items()
     ]  # fmt: skip
-    ranges = "unscreened ranges, as in P1" if run.conventional is not None else "the same screened ranges"
+    ranges = "unscreened ranges, as in paper P1" if run.conventional is not None else "the same screened ranges"
     large = (
         "The large figures refer to the filter along the track at all epochs. Figures of single epochs"
         if filtered

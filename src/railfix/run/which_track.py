@@ -279,7 +279,7 @@ class WhichTrackOptions(Settings):
 
 
 def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, config: Config) -> TrackDecision:
-    """Decide on which track a train at rest is, from its logs and a map.
+    """Determine the track on which a train stands, from its logs and a map.
 
     Raise a RailfixError (`railfix.core.errors`) if an option or a file is unusable, or if the train moves.
     """
