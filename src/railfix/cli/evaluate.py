@@ -363,8 +363,8 @@ def cn0_curve(
 def _print_curve(curve: Cn0Curve, notes: tuple[str, ...]) -> None:
     console, source = TableConsole(), curve.source
     console.print(
-        f"antenna {source.antenna or 'not named'}, receiver {source.receiver or 'not named'}; "
-        f"{source.epochs:,} epochs from {source.start[:19]} to {source.end[:19]}; mean C/N0 in dB-Hz over elevation"
+        f"antenna {source.antenna or 'not named'}, receiver {source.receiver or 'not named'}; {source.epochs:,} "
+        f"epochs from {source.start[:19]} to {source.end[:19]}; mean C/N0 in dB-Hz by elevation"
     )
     rows = []
     for mean in curve.means:

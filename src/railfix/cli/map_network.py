@@ -71,7 +71,7 @@ class Connecting(Settings):
         gt=0.0,
     )
     same_frame: Literal["no", "yes"] = option(
-        "The positions are in the frame of the map (as RTK positions are), not in the frame of the satellite orbits.",
+        "The positions are in the frame of the map (for example RTK), not in the frame of the satellite orbits.",
         "no",
         name="--same-frame",
     )

@@ -104,7 +104,7 @@ class ReferenceOptions(Settings):
     """Options that do not affect the reference."""
 
     logs: LogReading = Field(default_factory=LogReading)
-    overwrite: Overwrite = option("Replace results that are already there.", "refuse", name="--overwrite")
+    overwrite: Overwrite = option("Replace existing results.", "refuse", name="--overwrite")
     track: TrackReading = Field(default_factory=TrackReading)
     columns: ColumnNames = Field(default_factory=ColumnNames)  #: Column names of position logs in CSV.
 
