@@ -376,7 +376,7 @@ def write_evaluation(evaluation: Evaluation, folder: OutputFolder) -> dict[str, 
     tables.csv           error statistics of every grouping, one row per group
     intervals.csv        distances and times between positions
     levels.csv           protection levels, if a run has any
-    stanford_KIND.csv    counts of levels against errors; KIND is the kind of level (sbas, separation, train)
+    stanford_KIND.csv    epochs per region of the Stanford diagram; KIND: kind of level (sbas, separation, train)
     beyond_KIND.csv      epochs whose error exceeds the level
     outages.csv          stretches without satellites, if a table of the filter is evaluated
     branches.csv         stated branch probabilities and correctness of positions, if a filter table is evaluated
