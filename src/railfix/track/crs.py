@@ -1,7 +1,7 @@
 """Coordinate reference systems of maps, their relation to the ITRF, and PROJ operations between them.
 
-Definitions are from the EPSG dataset (https://epsg.org). Motions of countries relative to their plates are only stated
-in notes to the user.
+Definitions are from the EPSG dataset (https://epsg.org). Motions of countries relative to their plates are not
+corrected; notes to the user state them.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ class HeldFrame:
     itrf: str  #: Name of the ITRF realisation.
     epoch: float  #: Epoch of the coordinates [year].
     plate: str  #: Plate of the ITRF2020 plate motion model on which most of the country lies.
-    #: Smallest and largest motion of a point in the country relative to the plate [mm per year].
+    #: Lowest and highest speed of points of the country relative to the plate [mm per year].
     rest_mm: tuple[float, float] = (0.0, 1.0)
-    but: str = ""  #: Clause of the note to the user that states further neglected motions.
+    but: str = ""  #: Further neglected motions, as a clause of the note to the user.
     #: Second plate of the country, and two points (latitude, longitude) on the border between both plates. Seen from
     #: the first point to the second, the second plate is on the right.
     border: tuple[str, tuple[float, float], tuple[float, float]] | None = None
@@ -137,8 +137,8 @@ HELD: Final = {
     "Mexico ITRF2008": HeldFrame("ITRF2008", 2010.0, "NOAM", (0.0, 50.0)),
     "RGSPM06": HeldFrame("ITRF2000", 2006.0, "NOAM"),
 }
-#: Frames that are treated as another frame. The value is the EPSG code of the other frame, and a clause on the
-#: differences between both frames.
+#: Frames that are treated as another frame. Each value has the EPSG code of the frame that is used instead, and a
+#: clause on the differences between both frames.
 SAME: Final = {
     "NAD83(CSRS)": (
         "EPSG:8254",
@@ -162,15 +162,14 @@ REGIONAL: Final = {
     "JGD2011": "EPSG:6667", "KGD2002": "EPSG:4927", "TWD97": "EPSG:3823", "CGCS2000": "EPSG:4480",
     "NZGD2000": "EPSG:4959", "SIRGAS 2000": "EPSG:4989", "Hartebeesthoek94": "EPSG:4941",
 }  # fmt: skip
-MARGIN_DEG: Final = 0.5  #: Margin that is added around the area of use of a CRS [deg].
-#: Largest accepted deviation of the scale of a grid from 1 along a line; national grids deviate by up to 0.005.
+MARGIN_DEG: Final = 0.5  #: The area of use of a CRS is extended by this margin on all sides [deg].
+#: A map is rejected if the scale of its grid differs from 1 by more than this (national grids: up to 0.005).
 LARGEST_SCALE: Final = 0.01
-#: Worst accepted accuracy of a PROJ transformation to the working frame [m]. Transformations of older datums are less
-#: accurate.
+#: A frame counts as an older datum if all PROJ transformations to the working frame are less accurate than this [m].
 MODERN_M: Final = 0.5
 
 Box = tuple[float, float, float, float]  #: South, north, west and east [deg].
-#: Worst accepted accuracy of an operation [m]. An accuracy of 999 m in the EPSG dataset means unknown.
+#: PROJ operations that are less accurate than this are not used [m]; in the EPSG dataset, 999 m means unknown.
 WORST_M: Final = 100.0
 #: The steps of a PROJ operation that do not change the datum have names that begin with these words.
 _NO_DATUM_CHANGE: Final = ("axis order change", "Conversion from", "Null geographic offset", "Inverse of Conversion")
@@ -291,8 +290,8 @@ class Operations:
     def describe_lacking(self, crs: str | None = None) -> str:
         """Return a clause on the best operation whose grids are not installed, and on how to get the grids.
 
-        The clause is empty if there is no such operation. The best operation is the most accurate one, with preference
-        for operations whose grids can be downloaded by projsync.
+        The clause is empty if there is no such operation. The best operation is the most accurate one whose grids
+        projsync can download; if there is none, the most accurate of all.
         """
         if not self.lacking:
             return ""
@@ -315,7 +314,7 @@ def _is_served(operation: Any) -> bool:
 
 
 def name_operation(description: str, crs: str | None = None) -> str:
-    """Return the name of a PROJ operation without steps that do not change the datum; `crs` is the source CRS."""
+    """Shorten the name of a PROJ operation to the steps that change the datum; `crs` is the source CRS."""
     system = None if crs is None else find_crs(crs).to_2d()
     conversion = None if system is None else system.coordinate_operation
     left_out = (*_NO_DATUM_CHANGE, *([f"Inverse of {conversion.name}"] if conversion is not None else []))

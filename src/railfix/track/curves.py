@@ -20,14 +20,14 @@ from railfix.core.geodesy import axes_at
 from railfix.track.track import Track
 from railfix.track.trajectory import Trajectory
 
-#: Largest accepted difference between a chord's middle ordinates from the map's radius and from neighbouring points
-#: [m]. A radius with a larger difference is for another point or has the wrong sign, and is not used.
+#: A radius of the map is not used if a chord's middle ordinate with this radius differs by more than this from the
+#: middle ordinates of neighbouring points [m]: such a radius is for another point or has the wrong sign.
 _AGREES_M: Final = 0.03
 _CORNER_RAD: Final = 0.25  #: Change of direction above which a point is a corner, which the curve does not round [rad].
-#: Minimum distance of a ramp's end from the points before and after it, as a fraction of the distance between these
-#: points.
+#: A ramp's end is inserted only if it is farther from both neighbouring points than this fraction of the distance
+#: between them.
 _BREAK_SHARE: Final = 1e-3
-#: Minimum product of the change of slope at a ramp's end and the distance between the points around the end.
+#: A ramp's end is inserted only if the change of slope times the distance between its neighbours exceeds this.
 _LEAST_BREAK: Final = 1e-4
 _CHORD_M: Final = 2e-3  #: Largest distance of the curve from the chords of `curved_line` [m].
 
@@ -85,7 +85,7 @@ class CentreCurve:
 
 
 def centre_curve(track: Track) -> CentreCurve:
-    """Compute the curve through the points of a track without duplicate points."""
+    """Compute the curve through the points of a track, which must have no duplicate points."""
     step = np.diff(track.ecef_m, axis=0)
     axes = axes_at(track.ecef_m)
     before, after = (np.einsum("vij,vj->vi", axes[1:-1], part) for part in (step[:-1], step[1:]))

@@ -46,9 +46,9 @@ LAWS: Final[dict[str, tuple[Callable[[Floats], Floats], Callable[[Floats], Float
     ),
 }
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
-#: Largest turn within one quadrature interval [rad], up to which 12 nodes are exact except for rounding errors.
+#: Largest turn within one quadrature interval [rad]; up to this turn, 12 nodes are exact except for rounding errors.
 _PIECE_RAD: Final = 0.5
-_CHORD_M: Final = 0.01  #: Largest distance between the chords of an alignment's points and the alignment [m].
+_CHORD_M: Final = 0.01  #: Largest distance of the chords between points from the alignment [m].
 _LONGEST_M: Final = 25.0  #: Largest spacing of an alignment's points [m].
 #: Number of points on a profile clothoid; linear interpolation between the points is accurate to 1 um.
 _CLOTHOID_POINTS: Final = 2001
@@ -69,8 +69,8 @@ class PlanElement:
     length_m: float
     law: str = "linear"  #: Law of the curvature, a key of `LAWS`.
     #: For a Viennese bend, the height of the centre of gravity times the change of the cant angle, positive if the
-    #: right rail rises. The law of a Viennese bend is for the path of the centre of gravity. For other laws, the value
-    #: is 0.
+    #: right rail rises. The law of a Viennese bend describes the path of the centre of gravity. For other laws,
+    #: `lean_m` is 0.
     lean_m: float = 0.0
 
     def curvature_at(self, way_m: Floats) -> Floats:
@@ -114,7 +114,7 @@ class Stations:
     #: start of the alignment, the station just before the jump, and the station just after the jump [m].
     rows: tuple[tuple[float, float, float], ...]
     last_sign: float = 1.0  #: 1 if the stations rise after the last row, -1 if they fall.
-    jump_m: float = 0.05  #: Half length of the interval within which the kilometrage jumps.
+    jump_m: float = 0.05  #: A jump of the kilometrage is spread over this distance before and after it.
 
     @property
     def places_m(self) -> Floats:
@@ -252,7 +252,7 @@ def plan_starts(plan: Sequence[Plan]) -> Floats:
 
 
 def _by_start(place_m: Floats, starts: Sequence[float] | Floats) -> list[tuple[Masks, int]]:
-    """Return the mask of distances on each element, and the element's index; elements without distances are left out.
+    """Return, for each element that has distances, the mask of its distances and its index.
 
     A distance belongs to the last element that starts before it, or to the first element.
     """
@@ -296,7 +296,7 @@ def alignment_points(
     return alignment_at(place, plan, profile, cant), notes
 
 
-#: Largest accepted length of an alignment without a profile [m]; the outermost gradients continue there.
+#: An alignment is rejected if its profile leaves out more than this [m]; otherwise the outermost gradients continue.
 _PROFILE_BEYOND_M: Final = 50.0
 
 
@@ -374,7 +374,7 @@ def segment_of_design(
 
 
 def _check_profile(plan: Sequence[Plan], profile: Sequence[ProfileElement], *, path: str) -> tuple[str, ...]:
-    """Check that a profile covers the plan, and return a note on the length without a profile.
+    """Check that a profile covers the plan, and return a note on the length that it does not cover.
 
     Raise InputFileError if this length exceeds `_PROFILE_BEYOND_M`.
     """

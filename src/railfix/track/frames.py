@@ -80,13 +80,13 @@ def decimal_year(time: np.datetime64 | Datetimes) -> float:
 
 
 class MapMotion(TypedDict, total=False):
-    """Options for the motion of map coordinates that PROJ does not model."""
+    """Options for those motions of map coordinates that PROJ does not model."""
 
     epoch: float | None  #: Epoch of the map's coordinates, for a frame that is an ITRF realisation [year].
     plate: str | None  #: Plate, one of `PLATES`, with which ITRF coordinates move from `epoch` to the time of the log.
-    #: Parameter file of Japan's semi-dynamic correction (``SemiDynaEXE`` format). It transforms JGD2011 to the file's
-    #: epoch, including crustal deformation. With this file, `epoch` is the epoch of the file, after which the plate
-    #: motion is used.
+    #: Parameter file of Japan's semi-dynamic correction (``SemiDynaEXE`` format). The correction transforms JGD2011 to
+    #: the epoch of the file, including crustal deformation. If a file is given, `epoch` is its epoch; from then on, the
+    #: plate motion is used.
     parameters: FilePath | None
 
 
@@ -110,7 +110,7 @@ def points_at(
     ----------
     ecef_m : ndarray, shape (n, 3) [m]
     crs : str
-        CRS of the map. It is an assumption if `named` is False, because the map names no frame.
+        CRS of the map. If `named` is False, the map names no frame, and `crs` is an assumption.
     time : datetime64
         Time of the log.
 
@@ -240,7 +240,7 @@ def _realisation_note(frame: CRS, operation: Transformer) -> tuple[str, ...]:
 def _by_parameters(
     ecef_m: Floats, path: FilePath, year: float, epoch: float | None, plate: str
 ) -> tuple[Floats, str, tuple[str, ...]]:
-    """Transform JGD2011 coordinates by a semi-dynamic correction to its epoch, and then by plate motion.
+    """Transform JGD2011 coordinates to the epoch of a semi-dynamic correction, and then by plate motion.
 
     The correction is computed once for each cell of 0.001 deg. Raise InputFileError if the file is not valid or does
     not cover the map.
@@ -274,7 +274,7 @@ def _by_plate(ecef_m: Floats, plate: str, years: float) -> Floats:
 
 
 def _doubt(ecef_m: Floats, time: np.datetime64) -> tuple[str, ...]:
-    """Return a note that WGS 84 is assumed, with the resulting error if the map is in a usual frame of its region."""
+    """Return a note that WGS 84 is assumed, and how large the error is if the map is in a usual frame of its region."""
     latitude, longitude, _ = (float(v) for v in geodetic_from_ecef(ecef_m))
     found = []
     for name, code in REGIONAL.items():

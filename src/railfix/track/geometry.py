@@ -10,7 +10,7 @@ from railfix.core.arrays import Floats, Integers
 from railfix.core.geodesy import enu_axes
 from railfix.track.track import Track
 
-#: Length of the moving average of curvatures, from the points and from the map's radius [m].
+#: Length over which curvatures are averaged, both from the points and from the map's radius [m].
 _BEND_WINDOW_M = 40.0
 
 
@@ -69,7 +69,7 @@ def compute_geometry(track: Track) -> Geometry:
 
 
 def _windows(along: Floats, window_m: float) -> tuple[Floats, Floats]:
-    """Return the start and end of a window centred on each point, as chainages limited to the line, shape (V,) [m]."""
+    """Return start and end chainages of windows centred on points, cut off at the line's ends, shape (V,) [m]."""
     return np.maximum(along - window_m / 2.0, along[0]), np.minimum(along + window_m / 2.0, along[-1])
 
 

@@ -1,4 +1,4 @@
-"""Transformation of map coordinates to latitude and longitude in a modern frame, and its accuracy.
+"""Transformation of map coordinates to latitude and longitude in a modern frame, and accuracy of the transformation.
 
 A PROJ operation (https://proj.org) is used only if its area of use contains the map and its grids are installed.
 Ballpark operations, which do not change the datum, are not used.
@@ -145,7 +145,7 @@ def georeference(crs: str, x: Floats, y: Floats, *, path: str) -> Georeference:
 
 
 def to_map(crs: str, place: Georeference, *, path: str) -> tuple[Floats, Floats]:
-    """Return the coordinates of positions in a CRS (inverse of `georeference`), shape (n,) each.
+    """Transform positions to the coordinates of a CRS, shape (n,) each (inverse of `georeference`).
 
     Modern frames are treated as equal, which causes errors of up to 2 m. Raise SettingsError if PROJ has no installed
     operation for the positions.
@@ -226,7 +226,7 @@ def _targets(crs: str, box: Box) -> Iterable[str]:
 
 
 def _accuracy(crs: str, usable: tuple[Transformer, ...], box: Box) -> float:
-    """Return the accuracy of the first operation [m]: the larger of PROJ's value and the value implied by the others.
+    """Return the accuracy of the first operation [m]: PROJ's value, or a larger one implied by other operations.
 
     The first operation may be wrong by the difference of its result from another operation's result, minus the accuracy
     of the other operation. The result is NaN if PROJ states no accuracy for the first operation.
@@ -273,7 +273,7 @@ def _check_area(crs: str, latitude_deg: Floats, longitude_deg: Floats, *, path: 
 
 @lru_cache(maxsize=64)
 def _bounds(crs: str) -> Box:
-    """Return the area of use of a CRS's geodetic frame, extended by the margin; an empty box if it has no area."""
+    """Return the area of use of a CRS's geodetic frame, extended by `MARGIN_DEG`; an empty box if it has no area."""
     area = get_geodetic_frame(crs).area_of_use
     if area is None:
         return (np.inf, -np.inf, np.inf, -np.inf)
@@ -303,7 +303,7 @@ def _check_scale(crs: str, xy: Floats, latitude: Floats, longitude: Floats, *, p
 
 @lru_cache(maxsize=32)
 def _to_datum(crs: str) -> tuple[Transformer, float, float]:
-    """Return the conversion of a CRS to latitude and longitude on its datum, their unit and prime meridian [deg]."""
+    """Return the conversion of a CRS to angles on its datum, the unit of the angles, and the prime meridian [deg]."""
     system, datum = find_crs(crs), CRS.from_user_input(_find_frame(crs)).to_2d()
     plan = system.source_crs if system.is_bound and system.source_crs is not None else system
     meridian = datum.prime_meridian

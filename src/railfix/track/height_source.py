@@ -34,15 +34,15 @@ HeightSource = FilePath | PositionLog  #: File with heights, or positions in mem
 _SPACING_M: Final = 50.0  #: Largest spacing of points with heights [m].
 _WINDOW_CELLS: Final = 4_000_000  #: Largest number of raster cells that are read at once.
 _NEAR_M: Final = 15.0  #: Positions farther than this from the line in plan are not used [m].
-#: Largest distance along the line of a point from the positions that determine its height [m].
+#: Every point of the map needs a position of the log within this distance along the line [m].
 _REACH_M: Final = 200.0
 #: Standard deviation of the Gaussian weights along the line for RTK fixed positions [m].
 _KERNEL_M: Final = 15.0
 #: Standard deviation of the Gaussian weights along the line for single-point positions, whose errors persist for
 #: hundreds of metres [m]. These weights cause a height error of about 5 m in a vertical curve of 2 km radius.
 _LARGEST_KERNEL_M: Final = 150.0
-#: Constants of the robust locally weighted regression (Cleveland 1979, doi:10.1080/01621459.1979.10481038): limit of
-#: the deviation of a height, as a multiple of the median deviation, and number of reweighting iterations.
+#: Constants of the robust locally weighted regression (Cleveland 1979, doi:10.1080/01621459.1979.10481038): multiple of
+#: the median deviation at which a height loses its weight, and number of reweighting iterations.
 _ROBUST, _WEIGHED_AGAIN = 6.0, 2
 
 

@@ -220,9 +220,7 @@ def _map_conversion(
 
 
 def _place(step: _Step, alignment: _Entity, layout: _Entity, scale: float) -> _Placement:
-    """Return the placement of an alignment, or of its horizontal layout if that has a placement relative to the
-    alignment.
-    """
+    """Return the placement of an alignment, or of its horizontal layout if the layout is placed relative to it."""
     own, relative = alignment.values[5], layout.values[5]
     if relative is not None and own is not None and own in _chain(step, relative):
         own = relative

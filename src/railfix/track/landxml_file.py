@@ -37,8 +37,8 @@ _UNITS: Final = {
 _ORDINATES: Final[dict[str, Shape]] = {
     "cubic": "cubic", "cubicParabola": "cubic", "japaneseCubic": "cubic", "sineHalfWave": "half-sine",
 }  # fmt: skip
-#: Curvature laws of the other spirals. The biquadratic parabola (InfraModel, Finland) is Helmert's curve, whose
-#: curvature consists of two parabolas.
+#: Curvature laws of spirals that are not in `_ORDINATES`. The biquadratic parabola (InfraModel, Finland) is Helmert's
+#: curve, whose curvature consists of two parabolas.
 _SPIRALS: Final = {
     "clothoid": "linear",
     "bloss": "bloss",
@@ -47,12 +47,12 @@ _SPIRALS: Final = {
     "biquadraticParabola": "helmert",
 }
 _CANT_LAWS: Final = {**_SPIRALS, **dict.fromkeys(_ORDINATES, "linear"), "sineHalfWave": "cosine"}
-_SAME_M: Final = 1e-6  #: Shorter elements are left out, because they have no direction [m].
-#: Half length of the interval within which the kilometrage jumps at a station equation [m].
+_SAME_M: Final = 1e-6  #: Elements shorter than this are left out, because they have no direction [m].
+#: A jump of the kilometrage is spread over this distance before and after the station equation [m].
 _JUMP_M: Final = 0.05
-#: Smallest and largest accepted ratio of the curvature at a transition's curved end to 1 / stated radius.
+#: A transition is rejected if the curvature at its curved end, times the stated radius, is outside these limits.
 _ORDINATE_SHARE: Final = (0.9, 1.25)
-_BROKEN_RAD: Final = 0.1  #: Change of direction at a joint that indicates a wrong order of coordinates [rad].
+_BROKEN_RAD: Final = 0.1  #: Larger changes of direction at a joint suggest a wrong order of coordinates [rad].
 
 
 def finite_number(text: Any) -> float:

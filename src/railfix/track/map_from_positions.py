@@ -23,17 +23,17 @@ from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Provenance, Track
 #: Note in every map made from positions.
 ANTENNA_PATH = "the track was made from positions of an antenna: it is that antenna's path, not the centreline"
 _TURN: Final = -0.5  #: Cosine of 120 degrees, the change of direction beyond which the path counts as reversed.
-#: First limit of a position's distance from the straight line between its neighbours [m]. An outlier exceeds three
-#: limits: this one and the two that follow.
+#: An outlier is farther from the straight line between its neighbours than three limits. The first limit is this value
+#: [m].
 _BESIDE_M: Final = 5.0
-_BESIDE_MEDIANS: Final = 6.0  #: Second limit, as a multiple of the median of these distances.
-#: Third limit: the middle ordinate of a curve with this radius between the neighbours [m].
+_BESIDE_MEDIANS: Final = 6.0  #: The second limit for outliers is this multiple of the median distance.
+#: The third limit for outliers is the middle ordinate of a curve with this radius [m] between the neighbours.
 _LEAST_RADIUS_M: Final = 150.0
 _ROUNDS: Final = 20  #: Largest number of searches for outliers. Each search leaves out the outliers found before.
 _ENOUGH: Final = 10  #: Minimum number of positions for a search for outliers.
-#: Largest acceleration of the train. The deviation along the line that it can cause is not counted.
+#: Largest acceleration of the train. A position's deviation along the line is reduced by what it can cause.
 _ACCELERATION_MPS2: Final = 2.0
-#: The path between the neighbours of a position counts as straight if both are at most this time away [s].
+#: The path between the neighbours of a position counts as straight if both neighbours are within this time [s].
 _NEAR_S: Final = 2.5
 #: The path also counts as straight if its directions before and after the position are nearly parallel to the line
 #: between the neighbours. The value is the smallest accepted cosine of the angles to this line.
@@ -68,7 +68,7 @@ class Thinned:
     kept: Indices  #: Rows of the positions that became points of the map, in ascending order, shape (V,).
     dropped: dict[str, int]  #: Number of dropped rows by reason.
     jumps: Indices  #: Indices of points before a gap that exceeds `ThinningLimits.jump_m`, shape (j,).
-    jump_m: Floats  #: Length of the gap after each of these points, shape (j,).
+    jump_m: Floats  #: Length of the gap after each point in `jumps`, shape (j,).
     #: Indices of points at which the path turns by more than 120 degrees, shape (t,). The cause is a reversal or a
     #: wrong position.
     turns: Indices
@@ -99,7 +99,8 @@ def thin(
 
     First, rows are dropped that are NaN, not `usable`, out of reach, outliers, or stationary, so that noise and drift
     at standstill cause no loops. The selected points are at least `ThinningLimits.spacing_m` apart, except in bends
-    (`ThinningLimits.chord_m`). The last position is also kept if it is at least a fifth of the spacing ahead.
+    (`ThinningLimits.chord_m`). The last position is also kept if it is at least a fifth of the spacing beyond the point
+    before it.
     """
     limits = limits or ThinningLimits()
     finite = np.isfinite(ecef_m).all(axis=1)
@@ -207,8 +208,8 @@ def _outliers(time: Datetimes, ecef_m: Floats) -> Masks:
 def _goes_on(points: Floats, direction: Floats) -> Masks:
     """Return a mask of the inner points at which the path is straight, given the `direction` between both neighbours.
 
-    On each side of a point, two steps end at its neighbour: from the next point and from the second next point. At
-    least one of the two steps must have this direction; the other step may differ, because its point may be an outlier.
+    On each side of a point, its neighbour is joined to the next and to the second next point. One of these two steps
+    must be nearly parallel to `direction`; the point of the other step may be an outlier.
     """
     cosine = np.full((2, 2, len(direction)), -1.0)
     for span in (1, 2):
@@ -222,7 +223,7 @@ def _goes_on(points: Floats, direction: Floats) -> Masks:
 
 
 def _with_short_moves(points: Floats, stands: Masks, spacing_m: float) -> Masks:
-    """Extend the mask of stationary rows by movements between standstills that are shorter than the spacing."""
+    """Extend the mask of stationary rows by movements that are shorter than the spacing and between standstills."""
     if not stands.any():
         return stands
     edges = np.flatnonzero(np.diff(stands)) + 1
@@ -236,7 +237,7 @@ def _with_short_moves(points: Floats, stands: Masks, spacing_m: float) -> Masks:
 def _at_spacing(points: Floats, spacing_m: float) -> Indices:
     """Return the indices of points that are at least the spacing apart.
 
-    The last point is also returned if it is at least a fifth of the spacing ahead.
+    The last point is also returned if it is at least a fifth of the spacing beyond the point before it.
     """
     if not len(points):
         return np.zeros(0, dtype=np.intp)
@@ -259,7 +260,7 @@ def _at_spacing(points: Floats, spacing_m: float) -> Indices:
 
 
 def _with_bends(points: Floats, chosen: Indices, chord_m: float) -> Indices:
-    """Return the chosen points, and the farthest point from each chord with a deviation above `chord_m`."""
+    """Return the chosen points and, for each chord with points more than `chord_m` away, the farthest point."""
     if len(chosen) < 2:
         return chosen
     piece = np.searchsorted(chosen, np.arange(len(points)), side="right") - 1
@@ -378,7 +379,7 @@ SIGMA_OF_QUALITY: Final[Mapping[int, tuple[float, float]]] = MappingProxyType(
 def _accuracy(log: PositionLog, kept: Indices) -> tuple[float, float, str]:
     """Return the standard deviations of a map in plan and height [m], and a note on how they were obtained.
 
-    Each standard deviation is the largest of three values: stated in the log, for the quality number, and from P1.
+    Each standard deviation is the largest of the log's value, the value for the quality number, and P1's value.
     """
     plan, height = SIGMA_PLAN_M, SIGMA_HEIGHT_M
     stated = log.sigma_m[kept]

@@ -163,7 +163,7 @@ class Network(NotebookTable):
 
     @cached_property
     def _way(self) -> tuple[Floats, Floats]:
-        """Positions of points, and of starts of tracks, on an axis with all tracks in sequence, 1 m apart [m]."""
+        """Chainages of points and of track starts on an axis with all tracks in sequence and gaps of 1 m [m]."""
         before = np.concatenate([[0.0], np.cumsum(self.length_m + 1.0)[:-1]])
         return self.chainage_m + np.repeat(before, np.diff(self.first_point)), before
 
@@ -210,7 +210,7 @@ class Network(NotebookTable):
 
     @cached_property
     def _index(self) -> tuple[scipy.spatial.cKDTree, Indices, Indices, float]:
-        """k-d tree of samples on all tracks, their segments and tracks, and half the largest sample spacing [m]."""
+        """k-d tree of samples on all tracks, segment and track of each sample, half the largest sample spacing [m]."""
         steps = np.linalg.norm(np.diff(self.points_m, axis=0), axis=1)
         inner = np.ones(len(steps), dtype=np.bool_)
         inner[self.first_point[1:-1] - 1] = False

@@ -36,16 +36,16 @@ _FREEDOM: Final = 8.0  #: Degrees of freedom of Student's t for position errors.
 # Negative logarithms of transition probabilities per position. These values imply that a train is on unmapped track for
 # the fraction `UNMAPPED_PRIOR` of the time, in periods of a quarter of an hour. A change of track by way of unmapped
 # track is as improbable as a change between unconnected tracks.
-_JUMP_COST: Final = 17.0  #: From a mapped track to an unconnected mapped track.
-_LEAVE_COST: Final = 12.0  #: From a mapped track to an unmapped track that is parallel to no track.
-_ENTER_COST: Final = 5.0  #: From an unmapped track that is parallel to no track to a mapped track.
-_LEAVE_BESIDE_COST: Final = 10.0  #: From a mapped track to a parallel unmapped track.
-_ENTER_BESIDE_COST: Final = 7.0  #: From a parallel unmapped track to a mapped track.
+_JUMP_COST: Final = 17.0  #: Transition from a mapped track to an unconnected mapped track.
+_LEAVE_COST: Final = 12.0  #: Transition from a mapped track to an unmapped track that is parallel to no track.
+_ENTER_COST: Final = 5.0  #: Transition to a mapped track from an unmapped track that is parallel to no track.
+_LEAVE_BESIDE_COST: Final = 10.0  #: Transition from a mapped track to a parallel unmapped track.
+_ENTER_BESIDE_COST: Final = 7.0  #: Transition from a parallel unmapped track to a mapped track.
 #: Negative logarithm of the probability of passing an open end, where the map ends.
 _OPEN_COST: Final = 2.0
-#: Distance beyond an open end above which a position is off the map, in standard deviations of the position.
+#: A position is off the map if it is more than this number of its standard deviations beyond an open end.
 _BEYOND_SIGMAS: Final = 5.0
-#: Lower and upper bound of the distance `_BEYOND_SIGMAS` [m].
+#: The distance of `_BEYOND_SIGMAS` standard deviations is at least the first and at most the second value [m].
 _BEYOND_M: Final = (CLEARANCE_M, 10.0)
 _ROUNDED_M: Final = 1e-6
 #: A transition is possible if the path exceeds the straight distance between two positions by at most this length [m]
@@ -53,13 +53,13 @@ _ROUNDED_M: Final = 1e-6
 _SLACK_M: Final = 30.0
 #: Fraction of the straight distance; see `_SLACK_M`.
 _SLACK_SHARE: Final = 0.2
-#: Excess of the path length over the straight distance that halves the transition probability over joints [m].
+#: A transition over joints is half as likely if its path is longer than the straight distance by this length [m].
 _PASSING_M: Final = 5.0
-#: Cost of a change of track in the returned sequence. The unit is one pair of successive positions on correct tracks.
+#: Cost of a change of track in the returned sequence; each pair of successive positions on correct tracks gains 1.
 _CHANGE: Final = 0.5
 #: Cost of a change of track at a joint; smaller, because a short track in a switch has only one or two positions.
 _CHANGE_AT_JOINT: Final = 0.05
-_AT_JOINT: Final = 0.01  #: Transition probability from which a change of track counts as a change at a joint.
+_AT_JOINT: Final = 0.01  #: Changes of track that are at least this probable count as changes at a joint.
 COMMON_S: Final = 600.0  #: Correlation time of the common error [s].
 #: Number of balls in the urn of a horizontal axis. The common error has one more value per axis than the urn has balls.
 _BALLS: Final = 12

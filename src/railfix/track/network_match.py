@@ -24,7 +24,7 @@ from railfix.track.track import ANOTHER_PLACE_M
 #: Standard deviation of distances from the track, if it is neither stated in the log nor can be estimated [m].
 SIGMA_M: Final = 4.0
 _LEAST_SIGMA_M: Final = 1.0  #: Lower bound of the estimated standard deviation of the distance [m].
-#: Minimum difference of the distances to the nearest and second nearest track, for positions in the estimate [m].
+#: Sigma is estimated from positions whose second nearest track is farther than the nearest one by more than this [m].
 _ALONE_M: Final = 15.0
 #: Positions count as off the track if their median distance, scaled to a standard deviation, exceeds both this value
 #: [m] and `_BESIDE` times the position noise.
@@ -35,7 +35,7 @@ _ENOUGH: Final = 30  #: Minimum number of positions to estimate the standard dev
 _COMMON_M: Final = 2.0
 #: Ratio of the standard deviation of the common error to the stated standard deviation.
 _COMMON_SHARE: Final = 0.7
-_BEST: Final = 0.1  #: Quantile of the stated standard deviations to which `_COMMON_SHARE` applies.
+_BEST: Final = 0.1  #: `_COMMON_SHARE` is relative to this quantile of the stated standard deviations.
 _WITHIN_M: Final = 30.0  #: Minimum search distance for tracks [m].
 _WITHIN_SIGMAS: Final = 5.0  #: Search distance for tracks, in standard deviations of the position.
 _FARTHEST_M: Final = 100.0  #: Maximum search distance for tracks [m].
@@ -177,7 +177,7 @@ def match(
     sigma_m : float, optional [m]
         Standard deviation of a position's distance from the track; by default stated in the log or estimated.
     within_m : float, optional [m]
-        Largest distance of a position from its track; by default five standard deviations, with limits of 30 and 100 m.
+        Largest distance of a position from its track; by default five standard deviations, within 30 to 100 m.
     correlation_s : float [s]
         Correlation time of the position errors.
 

@@ -205,9 +205,9 @@ def _part(track: Segment, way: Floats, low: float, high: float, number: int) -> 
     )
 
 
-#: Distance between two unconnected ends below which the ends are reported as a gap in one track [m].
+#: Two unconnected ends are reported as a gap in one track if they are closer to each other than this [m].
 _GAP_M: Final = 5.0
-#: Distance between connected ends above which the ends are reported as a joint that does not meet [m].
+#: Connected ends are reported as a joint that does not meet if they are farther apart than this [m].
 _JOINT_M: Final = 0.5
 #: Change of direction at a navigable connection above which a kink is reported [deg]; a 1:4.5 switch turns by 12.5 deg.
 _KINK_DEG: Final = 15.0
@@ -215,7 +215,7 @@ _KINK_DEG: Final = 15.0
 _LEAST_SPACING_M: Final = 2.5
 #: The spacing of tracks is not checked within this distance of their ends, because tracks join in switches [m].
 _SWITCH_M: Final = 80.0
-_LEAST_WAY_M: Final = 10.0  #: Minimum length on which tracks are too near each other before they are reported [m].
+_LEAST_WAY_M: Final = 10.0  #: Tracks too near each other on a shorter length are not reported [m].
 
 
 @dataclass(frozen=True, kw_only=True)

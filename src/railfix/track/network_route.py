@@ -19,8 +19,8 @@ from railfix.track.network_match import Matched, PlanLog
 
 #: Rows to be filled: rows without a position ("gaps"), or in addition rows with positions off the map ("off-map").
 Rows = Literal["gaps", "off-map"]
-#: Limit for filling rows with positions off the map [m]. It applies to the distance of these positions from a track,
-#: and to the difference between route length and the distance travelled according to these positions.
+#: Rows with positions off the map are not filled if the length of the route differs by more than this from the distance
+#: travelled according to the positions, or if a route's open end is farther than this from a track [m].
 _DRIFT_M = 500.0
 _STEPS = 15  #: Length of the median filter for steps between positions, which suppresses jumps.
 
@@ -31,8 +31,8 @@ class Filled:
 
     track: Indices  #: Index of the track; -1 if the row has no position and was not filled.
     chainage_m: Floats  #: Chainage on the track.
-    #: Largest distance of the train from a filled position, provided that the train is on the route. It is infinite
-    #: before the first and after the last known position, and NaN in rows that were not filled.
+    #: Upper bound of the distance between the train and a filled position, provided that the train is on the route. It
+    #: is infinite before the first and after the last known position, and NaN in rows that were not filled.
     bound_m: Floats
 
 

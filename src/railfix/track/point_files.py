@@ -36,7 +36,7 @@ from railfix.track.vector_file import (
 RFC_CRS: Final = "OGC:CRS84"
 #: Property that identifies a connection of two tracks (`railfix.track.network_read`).
 RELATION: Final = "netelementA"
-#: Key in the properties of a line, whose value is all properties and the id of the line's feature.
+#: Key that is added to the properties of a line; the value has all properties and the id of the line's feature.
 _FEATURE: Final = "@feature"
 _MEMBERS: Final = ("height_datum", "geoid", "name", "sigma_plan_m", "sigma_height_m")
 
@@ -257,12 +257,12 @@ OPTIONAL_COLUMNS: Final[dict[str, tuple[str, float, float]]] = {
     "radius_m": ("radius_m", 1.0, np.inf),
     "gradient_permille": ("gradient_permille", 1.0, np.nan),
 }
-#: Columns with standard deviations of each point, for information only. Positioning uses the metadata of the map.
+#: Columns with standard deviations of each point, for information only; positioning uses the map's metadata instead.
 SIGMA_COLUMNS: Final = ("sigma_plan_m", "sigma_height_m")
 KNOWN_COLUMNS: Final = (
     "latitude_deg", "longitude_deg", "height_m", "elevation_m", "geoid_m", *OPTIONAL_COLUMNS, *SIGMA_COLUMNS,
 )  # fmt: skip
-#: Keys of the ``# key: value`` lines above the header that are used; other lines are ignored.
+#: Keys that are used in ``# key: value`` lines above the header; lines with other keys are ignored.
 KNOWN_METADATA: Final = ("name", "crs", "height_datum", "geoid", "sigma_plan_m", "sigma_height_m", "note")
 
 
