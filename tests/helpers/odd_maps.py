@@ -233,7 +233,7 @@ CASES: Final[tuple[Odd, ...]] = (
     Odd("out_of_order.csv", csv(LINE[np.random.default_rng(0).permutation(N)]), "found", "the direction turns by"),
     Odd("back_and_on.csv", csv(np.vstack([LINE[:25], LINE[15:]])), "found", "turns by 179.[0-9] degrees"),
     Odd("piece_missing.csv", csv(np.vstack([LINE[:10], LINE[35:]])), "found", "a curve in between would be missed"),
-    Odd("cant_in_metres.csv", _with(np.full(N, 0.1), "cant_mm"), "found", "it is in metres, where millimetres"),
+    Odd("cant_in_metres.csv", _with(np.full(N, 0.1), "cant_mm"), "found", "in metres instead of millimetres"),
     Odd("radius_in_kilometres.csv", _with(np.full(N, 0.5), "radius_m"), "found", r"radius of 0\.5 m"),
     Odd("kilometrage.csv", _with(_KILOMETRAGE, "kilometrage_m"), "right"),
     Odd("kilometrage_in_kilometres.csv", _with(_KILOMETRAGE / 1e3, "kilometrage_m"), "found", "metres were expected"),
@@ -272,7 +272,7 @@ CASES: Final[tuple[Odd, ...]] = (
     Odd("nan.geojson", geojson(LINE).replace("48.0,", "NaN,", 1), "refused", "that is not finite"),
     Odd("decimal_commas.geojson", geojson(LINE).replace("48.0,", '"48,0",', 1), "refused", "is not a number"),
     Odd("time_as_height.geojson", geojson(LINE - [0, 0, -1.7e9]), "found", "m is impossible"),
-    Odd("some_heights.geojson", geojson(LINE).replace(", 480.0]", "]", 1), "refused", "all must be without a height"),
+    Odd("some_heights.geojson", geojson(LINE).replace(", 480.0]", "]", 1), "refused", "or all [longitude, latitude]"),
     Odd("two_documents.geojson", geojson(LINE) + "\n" + geojson(LINE), "refused", "is not JSON"),
     Odd("collection.geojson", '{"type": "GeometryCollection", "geometries": []}', "refused", "LineString or MultiLine"),
     # -- files that GDAL reads

@@ -108,7 +108,7 @@ def test_a_gap_of_a_tunnel_is_bridged_and_one_run_states_what_it_does_not_see(ga
     assert np.percentile(across_m(survey, line), 95) < 2.0
     notes = " ".join(survey.track.provenance.notes)
     assert "1 gap in the runs bridged by a curve, the longest 2" in notes
-    assert "one run does not show the error that all its positions share: 1.0 m in plan and 2.0 m in height" in notes
+    assert "the accuracy of the map includes 1.0 m in plan and 2.0 m in height for this error" in notes
     assert survey.sigma_plan_m.min() > 0.99
     assert survey_line([whole, replace(whole, name="again")]).track.sigma_plan_m < survey.track.sigma_plan_m
 

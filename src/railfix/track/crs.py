@@ -103,7 +103,7 @@ HELD: Final = {
         "AUST",
         (0.0, 35.0),
         "as are the earthquakes of 2010 to 2016 (metres); the deformation grid of PROJ (projsync --area-of-use 'New "
-        "Zealand') includes both",
+        "Zealand') includes the motion and the earthquakes",
         border=("PCFC", (-44.6, 167.8), (-37.6, 178.5)),
     ),
     "PNG94": HeldFrame("ITRF92", 1994.0, "AUST", (0.0, 90.0)),

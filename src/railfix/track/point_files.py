@@ -121,7 +121,7 @@ class _GeojsonLine:
             raise self.error("a track needs at least two points")
         sizes = {len(point) if isinstance(point, list) else 0 for point in coordinates}
         if sizes != {2} and not sizes <= {3, 4}:
-            raise self.error("all points must be [longitude, latitude, height], or all must be without a height")
+            raise self.error("all points must be [longitude, latitude, height], or all [longitude, latitude]")
         try:
             values = np.array([point[:3] for point in coordinates], dtype=np.float64)
         except (TypeError, ValueError):
@@ -177,14 +177,14 @@ def _in_frame(path: str, crs: str, values: Floats) -> Georeference:
             point = values[int(np.argmax(over))]
             raise InputFileError(
                 path,
-                f"{crs}: [{point[0]:g}, {point[1]:g}] is not [longitude, latitude]; they may be swapped, or give a "
-                "projected CRS (crs, --crs)",
+                f"{crs}: [{point[0]:g}, {point[1]:g}] is not [longitude, latitude]; exchange swapped values, or give "
+                "the CRS of projected coordinates (crs, --crs)",
             )
     return georeference(crs, values[:, 0], values[:, 1], path=path)
 
 
 def read_geojson_segments(path: FilePath, reading: MapReading) -> list[Segment]:
-    """Read the lines of a GeoJSON file as segments; `reading` has options that the file does not state.
+    """Read the lines of a GeoJSON file as segments; `reading` states what the file does not, such as the CRS.
 
     Overpass JSON files (OpenStreetMap) are also read. Raise InputFileError if the file is not valid.
     """
@@ -342,7 +342,9 @@ def _check_columns(table: NamedColumns) -> tuple[str, ...]:
             raise table.header_error(f"column {wrong!r} is unknown; is {right!r} meant?")
     for wrong, right in misspelt(table.metadata, KNOWN_METADATA).items():
         if right not in table.metadata:
-            raise InputFileError(table.path, f"the line '# {wrong}: {table.metadata[wrong]}': is '# {right}' meant?")
+            raise InputFileError(
+                table.path, f"the line '# {wrong}: {table.metadata[wrong]}' is unknown; is '# {right}' meant?"
+            )
     for name in ("latitude_deg", "longitude_deg"):
         if name not in table:
             message = f"there is no column {name!r}; the columns are {', '.join(table.cells)}"
@@ -364,19 +366,19 @@ def _datum(table: NamedColumns, asked: str | None) -> str:
         if stated is not None and stated != datum:
             column, other = ("height_m", "elevation_m") if datum == "ellipsoidal" else ("elevation_m", "height_m")
             what = f"{source} is {stated!r}, but the column {column} is {datum}"
-            raise table.header_error(f"{what}; name the column {other}, or drop the setting")
+            raise table.header_error(f"{what}; name the column {other}, or remove the setting")
     return datum
 
 
 def check_degrees(table: NamedColumns, latitude_deg: Floats, longitude_deg: Floats) -> None:
-    """Raise InputFileError if coordinates cannot be degrees of latitude and longitude."""
+    """Raise InputFileError if the coordinates cannot be latitudes and longitudes in degrees."""
     outside = np.abs(latitude_deg) > 90.0
     if outside.any():
         row = int(np.argmax(outside))
         value = latitude_deg[row]
         hint = "check whether latitude and longitude are swapped"
         if abs(value) > 360.0:
-            hint = "degrees were expected, not minutes, seconds or metres of a grid (grids are read from GeoJSON)"
+            hint = "give degrees, not minutes, seconds, or metres in a grid (only GeoJSON files may be in a grid)"
         raise table.error(row, f"latitude_deg {value:g} is over 90; {hint}")
     outside = np.abs(longitude_deg) > 360.0
     if outside.any():
@@ -387,7 +389,7 @@ def check_degrees(table: NamedColumns, latitude_deg: Floats, longitude_deg: Floa
 
 
 def _place(crs: str | None, latitude: Floats, longitude: Floats, *, path: str) -> Georeference:
-    """Return the georeference of latitudes and longitudes in a geographic CRS, by default WGS 84.
+    """Georeference latitudes and longitudes, which are in a geographic CRS, by default WGS 84.
 
     Raise SettingsError if the CRS is not geographic or its unit is not the degree.
     """

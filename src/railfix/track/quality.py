@@ -21,18 +21,18 @@ from railfix.track.geometry import Geometry, compute_geometry, mean_gradients
 from railfix.track.track import BACKWARDS, HEIGHTS_M, Track, kilometrage_breaks
 
 Severity = Literal["error", "warning"]
-_COARSE_DEG: Final = 1e-5  #: Step of coordinates that count as rounded [deg]; it causes errors of up to 0.6 m.
-_LEAST_CANT_M: Final = 5e-4  #: If the largest cant of a map is below this value, the unit must be wrong [m].
+_COARSE_DEG: Final = 1e-5  #: Coordinates in steps of this count as rounded [deg]; errors are up to 0.6 m.
+_LEAST_CANT_M: Final = 5e-4  #: If the largest cant of a map is below this [m], the unit of the cant must be wrong.
 _NEAR_DUPLICATE_M: Final = 0.10  #: Spacing below which two points are reported as one point measured twice [m].
 _CURVED_1PM: Final = 1 / 3000  #: Curvature below which the track counts as straight [1/m].
 _ADVERSE_M: Final = 0.005  #: Absolute value of the cant up to which its sign is not checked [m].
-_CENTIMETRE_M: Final = 0.01  #: Largest distance between chord and arc at the spacing `needed_spacing_m` [m].
+_CENTIMETRE_M: Final = 0.01  #: Distance between chord and arc for which `needed_spacing_m` is computed [m].
 #: A point is a kink if the direction changes by more than this angle and the radius is below `least_radius_m`.
 _KINK_DEG: Final = 3.0
 _SHARP_KINK_DEG: Final = 15.0  #: Change of direction up to which a kink is a warning; a sharper kink is an error.
 #: Largest accepted distance of a point above or below the line through its neighbours.
 _HEIGHT_SPIKE_M: Final = 0.50
-#: Largest accepted difference between the gradients from the map and from the heights, over `_GRADIENT_WINDOW_M`.
+#: Largest accepted difference of the stated gradient from the gradient of the heights, over `_GRADIENT_WINDOW_M`.
 _GRADIENT_DIFFERENCE_PERMILLE: Final = 5.0
 _GRADIENT_WINDOW_M: Final = 100.0
 
@@ -40,15 +40,14 @@ _GRADIENT_WINDOW_M: Final = 100.0
 class MapLimits(Settings):
     """Limits of a track map; a value equal to its limit passes."""
 
-    #: Largest distance between chord and arc in mid-segment (P1 4.1(3)).
+    #: Largest accepted distance between chord and arc in mid-segment (P1 4.1(3)).
     mid_chord_m: float = Field(default=0.30, gt=0)
-    spacing_m: float = Field(default=50.0, gt=0)  #: Longest segment; P1 2.2(1) has tens of metres on straight track.
-    #: Length of a segment above which the segment is reported as a gap: a point is wrong, or a part of the line is
-    #: missing.
+    spacing_m: float = Field(default=50.0, gt=0)  #: Longest accepted segment; P1 2.2(1): tens of metres on straights.
+    #: A longer segment is reported as a gap, because a point is wrong or a part of the line is missing.
     gap_m: float = Field(default=2000.0, gt=0)
     least_radius_m: float = Field(default=60.0, gt=0)  #: Smallest radius that a railway vehicle can pass.
-    gradient_permille: float = Field(default=60.0, gt=0)  #: Steepest gradient of a segment.
-    cant_m: float = Field(default=0.20, gt=0)  #: Largest absolute value of the cant.
+    gradient_permille: float = Field(default=60.0, gt=0)  #: Largest accepted gradient of a segment.
+    cant_m: float = Field(default=0.20, gt=0)  #: Largest accepted absolute value of the cant.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +62,7 @@ class Finding:
     kilometrage_m: float  #: Kilometrage of the first point; NaN if unknown.
     value: float  #: Worst value in the range; NaN if the fault has no value.
     limit: float  #: Limit of the value; NaN if the fault has no limit.
-    sentence: str  #: Location and description of the fault for the user.
+    sentence: str  #: Message to the user: location and description of the fault.
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -103,22 +102,22 @@ def check_track(track: Track, *, limits: MapLimits | None = None) -> TrackQualit
 
 
 def error_note(quality: TrackQuality) -> tuple[str, ...]:
-    """Return a note with the number of map errors and the first error, or an empty tuple if there are no errors."""
+    """Return a note with the number of map errors and the description of the first one; empty without errors."""
     if not quality.errors:
         return ()
     return (
-        f"map check: {plural(quality.errors, 'error')}, {plural(quality.warnings, 'warning')}; the first error "
+        f"map check: {plural(quality.errors, 'error')}, {plural(quality.warnings, 'warning')}; the first error is "
         f"{quality.errors[0].sentence}; see railfix map check",
     )
 
 
 #: Severity and description of each kind of fault; ``{value}`` is the worst value, ``{limit}`` its limit.
 _FAULTS: Final[dict[str, tuple[Severity, str]]] = {
-    "duplicate": ("warning", "the same point is repeated; other commands read it once"),
+    "duplicate": ("warning", "the same point is repeated; other commands ignore the repetition"),
     "near duplicate": ("warning", "points only {value:.3f} m apart (limit {limit:g} m)"),
     "rounded": (
         "warning",
-        "latitude and longitude have at most five decimals: points may be off by 0.6 m or more; seven were expected",
+        "latitude and longitude have at most five decimals: points may be off by 0.6 m or more; give seven decimals",
     ),
     "gap": (
         "error",
@@ -129,37 +128,37 @@ _FAULTS: Final[dict[str, tuple[Severity, str]]] = {
     "kink": ("warning", "the direction turns by {value:.1f} degrees at one point (limit {limit:g})"),
     "kilometrage break": (
         "warning",
-        "the kilometrage changes by {value:.4g} m, but the distance is different; metres were expected",
+        "the kilometrage changes by {value:.4g} m, which is not the distance; check whether it is in metres",
     ),
     "kilometrage reversal": ("warning", "the kilometrage reverses its direction"),
     "kilometrage absent": ("warning", "the map has no kilometrage here"),
     "height": (
         "error",
-        "a height of {value:,.0f} m is impossible; check whether it is in millimetres, or a code for a missing height",
+        "a height of {value:,.0f} m is impossible; check whether it is in millimetres or means a missing height",
     ),
-    "gradient": ("warning", "the gradient of the heights is {value:.1f} per mille (limit {limit:g})"),
+    "gradient": ("warning", "the gradient from the heights is {value:.1f} per mille (limit {limit:g})"),
     "height spike": (
         "error",
         "the height deviates from the line through its neighbours by {value:.2f} m (limit {limit:g} m)",
     ),
     "gradient attribute": (
         "warning",
-        "gradient_permille differs from the heights by {value:.1f} per mille (limit {limit:g}); rising is positive",
+        "gradient_permille is {value:.1f} per mille off the heights' gradient (limit {limit:g}); rising is positive",
     ),
     "cant": ("error", "cant of {value:.3f} m (limit {limit:g} m); check whether the column is in millimetres"),
     "small cant": (
         "error",
-        "the largest cant is {value:.2g} m; check whether it is in metres, where millimetres are expected",
+        "the largest cant is {value:.2g} m; check whether the column is in metres instead of millimetres",
     ),
     "cant side": (
         "error",
-        "cant of {value:.3f} m is negative in curves; it is the height of the outer rail above the inner rail, "
-        "positive in curves to either side",
+        "cant of {value:.3f} m is negative in curves; cant is the height of the outer rail above the inner rail, "
+        "positive in left and right curves",
     ),
     "radius": ("error", "radius of {value:.1f} m (limit {limit:g} m)"),
     "radius side": (
         "error",
-        "radius_m has the opposite sign of the bend of the points; right is positive in the direction of the file",
+        "radius_m has the wrong sign for the curve of the points; in the order of the file, right is positive",
     ),
 }
 
@@ -226,8 +225,8 @@ def _shape(track: Track, geometry: Geometry, limits: MapLimits) -> Iterator[Find
 def _cant_side(track: Track, geometry: Geometry) -> Iterator[Finding]:
     """Yield a finding for each curve with negative cant.
 
-    The findings are errors if all curves to one side have negative cant. Otherwise they are warnings, because negative
-    cant is usual in turnouts.
+    The findings are errors if all left curves or all right curves have negative cant. Otherwise they are warnings,
+    because negative cant is usual in turnouts.
     """
     of_points = np.where(np.abs(geometry.point_curvature) > _CURVED_1PM, np.sign(geometry.point_curvature), 0.0)
     of_map = np.where(np.isinf(track.radius_m), 0.0, np.sign(track.radius_m))
@@ -240,7 +239,7 @@ def _cant_side(track: Track, geometry: Geometry) -> Iterator[Finding]:
 
 
 def needed_spacing_m(quality: TrackQuality) -> float:
-    """Return the point spacing [m] at which all chords are within 1 cm of the arc; infinite without curves."""
+    """Return the point spacing [m] at which all chords are within 1 cm of the arc; infinite on straight track."""
     geometry = quality.geometry
     bend = np.where(np.isnan(geometry.map_curvature), geometry.point_curvature, geometry.map_curvature)
     sharpest = float(np.nanmax(np.abs(bend), initial=0.0))

@@ -36,16 +36,16 @@ def read_track(
 ) -> Track:
     """Read the centreline of a route from map files.
 
-    Formats are CSV (``.csv``) and GeoJSON (``.geojson``, ``.json``), also compressed; GeoPackage, Shapefile,
-    FlatGeobuf, GML, GPX, KML, DXF and OpenStreetMap through GDAL; alignments of IFC 4.3 (``.ifc``) and LandXML; railML
-    3 (``.xml``, ``.railml``); RDF of RINF; and tables of EGNSS MATE.
+    CSV (``.csv``) and GeoJSON files (``.geojson``, ``.json``) may be compressed. Further formats are, through GDAL,
+    GeoPackage, Shapefile, FlatGeobuf, GML, GPX, KML, DXF and OpenStreetMap; alignments in IFC 4.3 (``.ifc``) and
+    LandXML; railML 3 (``.xml``, ``.railml``); RINF as RDF; and the tables of EGNSS MATE.
 
     Parameters
     ----------
     paths : path or sequence of paths
         Several files are joined in the given order; each file is reversed if necessary.
     crs : str, optional
-        Coordinate reference system of files that do not name it, for example ``EPSG:6677``.
+        Coordinate reference system of files that state none, for example ``EPSG:6677``.
     height_datum : {"ellipsoidal", "orthometric"}, optional
         Height datum of GeoJSON files that do not state it; in CSV files the column name states the datum.
     geoid : str, optional
@@ -53,7 +53,7 @@ def read_track(
     name : str, optional
         Name of the route; by default the name in the file, otherwise the file name.
     max_gap_m : float [m]
-        Widest gap between two segments that is bridged.
+        Largest gap between two segments that is bridged.
     sigma_plan_m, sigma_height_m : float, optional [m]
         Standard deviations of the map in plan and in height; by default the values stated in the file or, if the file
         states none, 0.30 m and 0.60 m (P1 4.1(3)).
@@ -104,7 +104,7 @@ def track_of_segments(
     max_gap_m: float = MAX_GAP_M,
     sigma_height_m: float | None = None,
 ) -> Track:
-    """Join segments to a track, with heights from `heights` if the segments have no heights; see `read_track`."""
+    """Join segments to a track; if they have no heights, use the file `heights`; see `read_track`."""
     check_heights(segments, heights, geoid=geoid, height_datum=height_datum, sigma_height_m=sigma_height_m)
     track = join(
         [replace(s, height_m=np.zeros(len(s.height_m))) if s.height_datum == NO_HEIGHTS else s for s in segments],
@@ -136,13 +136,13 @@ def check_heights(
         raise InputFileError(
             flat[0].source,
             "the coordinates have no height; give heights (--heights): a profile by chainage; a log of 3-D positions; "
-            "`log`, in railfix run, for the heights of the log's own positions; or a raster file with height_datum "
+            "in railfix run, `log` for the heights of the log's own positions; or a raster file with height_datum "
             "(--height-datum), sigma_height_m (--height-sigma) and, for orthometric heights, geoid (--geoid) "
             f"({GEOIDS})",
         )
     if heights is not None and len(flat) < len(segments):
         raise SettingsError(
-            f"{segments[0].source} has heights itself; heights (--heights) are for maps without heights"
+            f"{segments[0].source} already has heights; heights (--heights) are for maps without heights"
         )
     if isinstance(heights, str | PathLike) and ending(heights) in RASTERS:
         check_raster(heights, geoid=geoid, height_datum=height_datum, sigma_m=sigma_height_m)
@@ -188,7 +188,7 @@ def _with_usual_accuracy(segment: Segment, file: str) -> Segment:
 
 
 def _with_given_accuracy(segment: Segment, given_m: float) -> Segment:
-    """Return a segment with a given accuracy in plan, which includes the accuracy of the datum transformation."""
+    """Return a segment with a given accuracy in plan, in which the datum transformation is already included."""
     note = f"map: {given_m:g} m in plan (--plan-sigma) is better than the accuracy of the map's transformation"
     notes = [note] if segment.datum_plan_m > given_m else []
     return replace(_with_accuracy(segment, given_m, *notes), datum_plan_m=0.0)

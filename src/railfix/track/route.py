@@ -67,11 +67,11 @@ class Segment:
     gradient_permille: Floats
     crs: str  #: CRS of the file.
     height_datum: str  #: Height datum of the file.
-    geoid: str  #: Geoid by which the heights were converted.
+    geoid: str  #: Geoid with which the heights were converted.
     metadata: dict[str, str]  #: Name, accuracy and origin of the segment, if stated in the file.
     frame: str = "EPSG:4979"  #: Geographic CRS of the coordinates of the segment.
-    #: Standard deviation of the datum transformation in plan; NaN if unknown. It increases the standard deviation of
-    #: the map.
+    #: Standard deviation of the datum transformation in plan; NaN if unknown. The standard deviation of the map
+    #: includes it (`sigma_of_files`).
     datum_plan_m: float = 0.0
     datum_height_m: float = 0.0  #: Standard deviation of the datum transformation in height; NaN if unknown.
     notes: tuple[str, ...] = ()
@@ -114,7 +114,7 @@ def make_segment(
 
 
 SAME_POINT_M = 0.05  #: Distance below which the ends of two segments count as the same point [m].
-MAX_GAP_M = 1.0  #: Widest gap between the ends of two segments that is bridged by a straight line [m].
+MAX_GAP_M = 1.0  #: Gaps between segments up to this length are bridged by a straight line [m].
 
 
 def _ends(segments: Sequence[Segment]) -> Floats:
@@ -124,7 +124,7 @@ def _ends(segments: Sequence[Segment]) -> Floats:
     return ecef_from_geodetic(ends[:, 0], ends[:, 1], np.nan_to_num(ends[:, 2]))
 
 
-#: Largest accepted fraction of points at which the line turns by more than 90 degrees, as it does where trains reverse.
+#: Largest accepted fraction of points at which the line turns by more than 90 degrees, as where trains reverse.
 _MOST_BACK: Final = 0.05
 
 
@@ -137,14 +137,13 @@ def check_order(segments: Iterable[Segment]) -> None:
         if back > max(_MOST_BACK * len(points), 3):
             raise InputFileError(
                 segment.source,
-                f"the direction turns by more than 90 degrees at {back} of {len(points)} points, which are not in the "
-                "order of the line; sort them (railfix map check shows where)",
+                f"the direction turns by more than 90 degrees at {back} of {len(points)} points, so the points are not "
+                "in the order of the line; sort them (railfix map check shows where)",
             )
 
 
 def orient(segments: Sequence[Segment], *, max_gap_m: float = MAX_GAP_M) -> list[Segment]:
-    """Return the segments in the same order, with segments reversed so that each one begins where the previous one
-    ends.
+    """Return the segments in the same order, reversed where necessary so that each begins where the previous one ends.
 
     Raise InputFileError if a gap is wider than `max_gap_m`.
     """
@@ -153,8 +152,8 @@ def orient(segments: Sequence[Segment], *, max_gap_m: float = MAX_GAP_M) -> list
         k, size = gap
         raise InputFileError(
             segments[k].source,
-            f"neither end meets the end of {segments[k - 1].source}: the gap is {size:.2f} m, the limit "
-            f"{max_gap_m:g} m; give the segments in the order of the route, or make a route of a network with "
+            f"neither end of it meets the end of {segments[k - 1].source}: the gap is {size:.2f} m (limit "
+            f"{max_gap_m:g} m); give the segments in the order of the route, or make a route of a network with "
             "'railfix map route'",
         )
     turned = _turn(_ends(segments), max_gap_m)
@@ -162,7 +161,7 @@ def orient(segments: Sequence[Segment], *, max_gap_m: float = MAX_GAP_M) -> list
 
 
 def _turn(ends: Floats, max_gap_m: float) -> list[bool]:
-    """Return whether each segment must be reversed to begin where the previous one ends; `ends` has shape (n, 2, 3)."""
+    """Return, for each segment, whether it must be reversed to continue the line; `ends` has shape (n, 2, 3)."""
     turned = [False] * len(ends)
     if len(ends) > 1:
         distance = np.linalg.norm(ends[0][:, None] - ends[1][None, :], axis=-1).min(axis=1)
@@ -197,9 +196,9 @@ def join(
 ) -> Track:
     """Join segments to one track.
 
-    A point shared by two segments is kept once. The attributes of this point are from the earlier segment; an attribute
-    that the earlier segment lacks is from the later segment. Raise InputFileError if segments do not meet, and
-    MismatchError if their frames differ.
+    A point shared by two segments is kept once. Attributes of this point are taken from the earlier segment or, where
+    it lacks them, from the later segment. Raise InputFileError if segments do not meet, and MismatchError if their
+    frames differ.
     """
     pieces = orient(segments, max_gap_m=max_gap_m)
     ends = _ends(pieces)
@@ -251,8 +250,7 @@ def _unique(values: Iterable[str]) -> tuple[str, ...]:
 
 
 def sigma_of_files(pieces: Sequence[Segment], key: str, default: float) -> float:
-    """Return the largest standard deviation of the pieces [m], each including the standard deviation of its datum
-    transformation.
+    """Return the largest standard deviation of the pieces [m]; it includes the piece's datum transformation.
 
     The standard deviation of a piece is the metadata entry `key` of its file, or `default` if the file has no such
     entry. Raise InputFileError if an entry is not a positive number.

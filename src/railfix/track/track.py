@@ -19,14 +19,14 @@ from railfix.core.notebook import NotebookTable, plural
 
 SIGMA_PLAN_M = 0.30  #: Standard deviation of an aerial survey's centreline in plan [m] (P1 4.1(3)).
 SIGMA_HEIGHT_M = 0.60  #: Standard deviation of the centreline's height, about twice `SIGMA_PLAN_M` [m] (P1 4.1(3)).
-#: Note on a section that is joined in reverse order, without the section's name.
+#: Note on a section that is joined in reverse order; the section's name precedes it.
 BACKWARDS = "is used against the order of its points"
 UNNAMED = "not named (WGS 84 assumed)"  #: `Provenance.crs` of a map that names no reference system.
-#: The kilometrage has a break in a segment if its change and the length of the segment differ by more than this value
-#: plus a twentieth of the length [m].
+#: The kilometrage has a break in a segment if the change of kilometrage differs from the length of the segment by more
+#: than this value plus a twentieth of the length [m].
 KILOMETRAGE_BREAK_M = 1.0
 HEIGHTS_M = (-1000.0, 9000.0)  #: Range of accepted ellipsoidal heights, including tunnels below the sea [m].
-ANOTHER_PLACE_M = 100_000.0  #: Distance between a log and a map above which they are of different regions [m].
+ANOTHER_PLACE_M = 100_000.0  #: A log and a map farther apart than this are taken as of different regions [m].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +73,7 @@ class Track(NotebookTable):
     radius_m: Floats
     gradient_permille: Floats  #: Gradient, positive if the line rises with chainage; NaN if unknown; shape (V,).
     section: Integers  #: Index of each point's section in `sections`, shape (V,).
-    sections: tuple[str, ...] = ("track",)  #: Files or features that were joined to the route, in order.
+    sections: tuple[str, ...] = ("track",)  #: Files or features that were joined to form the route, in order.
     sigma_plan_m: float = SIGMA_PLAN_M  #: Standard deviation of the map across the line.
     sigma_height_m: float = SIGMA_HEIGHT_M  #: Standard deviation of the map in height.
     provenance: Provenance = field(default_factory=Provenance)

@@ -70,7 +70,7 @@ class NearestOnPolyline:
         return index, along, offset
 
     def _among(self, points: Floats, candidates: int) -> tuple[Indices, Floats, Floats, Masks]:
-        """Find the nearest of the segments with the nearest samples, and whether no other segment can be nearer."""
+        """Find the nearest segment among those of the nearest samples, and whether no other segment can be nearer."""
         nearest = self._tree.query(points, k=np.arange(1, candidates + 1))
         distance, sample = np.asarray(nearest[0], dtype=np.float64), np.asarray(nearest[1], dtype=np.intp)
         chosen, share, best = nearest_segments(points, self._segment[sample], self._start, self._step)
@@ -93,11 +93,11 @@ def nearest_segments(
 #: Largest distance of a closed line's end from another part of the line [m]; parallel tracks are farther apart.
 _CLOSED_M: Final = 3.0
 _SAME_WAY: Final = 0.9  #: Cosine of the largest angle between two parts that count as parallel.
-_END_M: Final = 100.0  #: Length of the line next to its end that is not searched [m].
+_END_M: Final = 100.0  #: Parts of the line within this length of its end are not searched [m].
 
 
 def joins_m(arc_m: Floats, ecef_m: Floats) -> tuple[float, float]:
-    """Return the arc lengths at which a closed line continues before its start and after its end [m]; NaN if open."""
+    """Return the arc lengths at which a closed line passes its start again, and its end again [m]; NaN if open."""
     segment = np.diff(ecef_m, axis=0)
     segment /= np.linalg.norm(segment, axis=1, keepdims=True)
     return _beside(arc_m, ecef_m, segment, 0), _beside(arc_m, ecef_m, segment, -1)
@@ -143,7 +143,8 @@ class Trajectory(FrozenArrays, NotebookTable):
     antenna_ahead_m: float = 0.0
     #: Distance from the midpoint between the bogies to the vehicle's front end; None if unknown.
     front_end_m: float | None = None
-    rear_end_m: float | None = None  #: Distance from this midpoint to the vehicle's rear end; None if unknown.
+    #: Distance from the midpoint of the bogies to the vehicle's rear end; None if unknown.
+    rear_end_m: float | None = None
     #: Distance between the wheels' contact points, over which cant is measured; None without a vehicle.
     contact_m: float | None = None
     sigma_plan_m: float = SIGMA_PLAN_M  #: Standard deviation of the map in plan, used in the solution.
@@ -162,9 +163,7 @@ class Trajectory(FrozenArrays, NotebookTable):
         freeze_arrays(self)
         if not (np.diff(self.chainage_m) > 0).all():
             i = int(np.argmin(np.diff(self.chainage_m)))
-            raise ValueError(
-                f"chainage_m must rise strictly; point {i + 1} at {self.chainage_m[i]:.3f} m repeats or runs back"
-            )
+            raise ValueError(f"chainage_m must rise strictly; point {i + 1} at {self.chainage_m[i]:.3f} m does not")
         if not (self.length_m > 0).all():
             raise ValueError(f"point {int(np.argmin(self.length_m))} and the next point are equal")
 
@@ -200,7 +199,7 @@ class Trajectory(FrozenArrays, NotebookTable):
 
     @cached_property
     def joins_m(self) -> tuple[float, float]:
-        """Arc lengths at which a closed line continues before its start and after its end [m]; NaN at an open end."""
+        """Arc lengths at which a closed line passes its start again, and its end again [m]; NaN at an open end."""
         return joins_m(self.arc_m, self.ecef_m)
 
     @cached_property
@@ -312,7 +311,7 @@ class Trajectory(FrozenArrays, NotebookTable):
         return np.where(inside, np.interp(chainage, self.chainage_m, self.arc_m), np.nan)
 
     def kilometrage_at(self, arc_m: ArrayLike) -> Floats:
-        """Interpolate the kilometrage at arc lengths, except across breaks [m]; NaN where unknown."""
+        """Interpolate the kilometrage at arc lengths [m], but not across breaks; NaN where unknown."""
         return interpolate_kilometrage(self.chainage_at(arc_m), self.chainage_m, self.kilometrage_m)
 
     def nearest(self, ecef_m: ArrayLike) -> tuple[Floats, Floats]:

@@ -1,7 +1,7 @@
 """Transition curves in plan that are defined by their offsets from the tangent: cubic parabolas and the half-sine.
 
 The abscissa x is measured along the tangent from the straight end, and the ordinate y is the offset from the tangent. X
-is the length on the tangent, and R is the radius at the curved end:
+is the length projected on the tangent, and R is the radius at the curved end:
 
 - The cubic parabola ``y = x^3 / (6 R X)`` is used by many railways. IFC defines ``y = x^3 / (6 R L)`` with the length L
   of the curve.
@@ -36,7 +36,7 @@ class OrdinateElement:
     x_m: float  #: Easting of the first point.
     y_m: float  #: Northing of the first point.
     direction_rad: float  #: Direction at the first point, counter-clockwise from the x axis (east).
-    tangent_m: float  #: Length X on the tangent.
+    tangent_m: float  #: Length X projected on the tangent.
     ordinate_m: float  #: Ordinate at X, positive to the left of the tangent, seen from the straight end.
     shape: Shape = "cubic"
     into: bool = True  #: Whether the first point is the straight end.

@@ -133,7 +133,7 @@ def find_level(tags: Mapping[str, Any]) -> int:
 
 
 def with_left_out(path: FilePath, segments: list[Segment], reasons: Counter[str]) -> list[Segment]:
-    """Add a note on lines that were left out to the first segment, and return the segments.
+    """Add to the first segment a note on the lines that were left out, and return the segments.
 
     Raise InputFileError if there is no segment.
     """
@@ -175,7 +175,7 @@ def read_osm_xml(path: FilePath) -> list[Way]:
 
 
 def _is_crossing(tags: Mapping[Any, Any]) -> bool:
-    """Return whether a node is a crossing of tracks without a connection (no slip)."""
+    """Return whether a node is a crossing of tracks without a connection (no slip switch)."""
     return tags.get("railway") == "railway_crossing" and not tags.get("railway:switch")
 
 
@@ -186,7 +186,7 @@ def read_overpass(path: str, elements: Any) -> list[Way]:
     not valid or there is no railway way.
     """
     if not isinstance(elements, list) or not all(isinstance(e, dict) for e in elements):
-        raise InputFileError(path, "'elements' is not a list of objects, as in Overpass files")
+        raise InputFileError(path, "'elements' must be a list of objects, as in Overpass files")
     nodes = {str(e["id"]): _place(path, e.get("lon"), e.get("lat")) for e in elements if e.get("type") == "node"}
     crossings = {str(e["id"]) for e in elements if e.get("type") == "node" and _is_crossing(e.get("tags") or {})}
     ways = []
@@ -235,7 +235,7 @@ def _ways(
     if not found and short:
         raise InputFileError(path, f"{short[0].row[_LEFT_OUT]}; also request the nodes from Overpass (out geom;)")
     if not found:
-        raise InputFileError(path, "no way in this file has a tag railway")
+        raise InputFileError(path, "none of the ways in this file has the tag 'railway'")
     return [*found, *short]
 
 
@@ -281,7 +281,7 @@ def read_layers(path: FilePath, *, geometry: str) -> list[tuple[str | None, list
 
 
 def read_vector_segments(path: FilePath, reading: MapReading) -> list[Segment]:
-    """Read the lines of a map file as segments; `reading` has the options that the file does not state.
+    """Read the lines of a map file as segments; `reading` states what the file does not, such as the CRS.
 
     Raise InputFileError if the file has no track, or a line is not valid.
     """

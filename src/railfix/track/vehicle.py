@@ -78,7 +78,7 @@ class Vehicle(Settings):
     @model_validator(mode="after")
     def _front_end_on_vehicle(self) -> Self:
         if self.length_m is not None and self.front_end_m is not None and self.front_end_m > self.length_m:
-            raise ValueError("front_end_m must be at most length_m, so that the middle is between the two ends")
+            raise ValueError("front_end_m must be at most length_m, so that the bogies' midpoint is between the ends")
         return self
 
 
@@ -98,8 +98,8 @@ class Body:
     The axes are defined for a vehicle that faces rising chainage.
     """
 
-    lower_m: Floats  #: Chainage of the bogie centre with the lower chainage, shape (n,).
-    upper_m: Floats  #: Chainage of the bogie centre with the higher chainage, shape (n,).
+    lower_m: Floats  #: Lower of the chainages of the two bogie centres, shape (n,).
+    upper_m: Floats  #: Higher of the chainages of the two bogie centres, shape (n,).
     origin: Floats  #: ECEF position midway between the bogie centres, shape (n, 3) [m].
     #: Unit vectors of the body axes in ECEF, shape (n, 3).
     forward: Floats
@@ -246,7 +246,7 @@ def _place(body: Body, vehicle: Vehicle, offset: AntennaOffset) -> Floats:
 
 
 def _abeam(line: _VehicleLine, body: Body, antenna: Floats, along_m: float) -> Floats:
-    """Return the chainage at which the centreline crosses the plane through the antenna and across the body [m]."""
+    """Return the chainage [m] at which the centreline crosses the antenna's plane perpendicular to the body."""
     chainage = (body.lower_m + body.upper_m) / 2.0 + along_m
     for _ in range(_MAX_ITERATIONS):
         ahead = np.einsum("vi,vi->v", line.at(chainage) - antenna, body.forward)
@@ -366,7 +366,7 @@ def antenna_trajectory(
     if not (np.diff(chainage) > 0).all():
         i = int(np.argmin(np.diff(chainage)))
         raise MismatchError(
-            f"{track.name}: the line bends so sharply near chainage {chainage[i]:.1f} m that the antenna runs back"
+            f"{track.name}: the line bends so sharply near chainage {chainage[i]:.1f} m that the antenna moves back"
         )
     cant = np.interp(chainage, track.chainage_m, np.where(np.isnan(track.cant_m), 0.0, track.cant_m))
     return Trajectory(

@@ -1,1 +1,1 @@
-"""Track maps from several runs with ordinary receivers: all positions are adjusted to one line."""
+"""Track maps from several runs with ordinary receivers, by an adjustment of all positions to one line."""

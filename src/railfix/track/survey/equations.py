@@ -14,8 +14,8 @@ from railfix.core.geodesy import range_with_rotation
 from railfix.track.survey.passes import Ties
 from railfix.track.survey.runs import CLIMB_MPS2, RunSignals, SurveyLimits, SurveyRun
 
-#: Standard deviation of the second difference of the line's shifts from the reference line [m]. Across the line, it is
-#: larger by `_CORNER_M` times the squared turn [rad], because at a corner a lateral shift bends the line.
+#: Standard deviation of the pseudo-observation that shifts of the line have the second difference 0 [m]. For shifts
+#: across the line, `_CORNER_M` times the squared turn [rad^2] is added, because they bend the line at a corner.
 _BEND_M: Final = 0.05
 _CORNER_M: Final = 5.0
 
@@ -40,20 +40,20 @@ class Equations:
     matrix: sp.csr_array  #: Design matrix, shape (n * size, unknowns).
     value: Floats  #: Observed values, shape (n * size,).
     size: int  #: Number of rows per observation.
-    share: Floats  #: Weight of each observation relative to an independent observation, shape (n,).
+    share: Floats  #: Weight of each observation; 1 if its error is independent, shape (n,).
     robust: bool = True  #: Whether outliers are down-weighted.
-    scaled: bool = False  #: Whether the standard deviations are scaled by the residuals.
+    scaled: bool = False  #: Whether standard deviations are scaled to agree with the residuals.
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunColumns:
     """Columns of the unknowns of one run."""
 
-    row: Indices  #: First of three columns of each row's coordinates.
+    row: Indices  #: For each row of the run, the first of the three columns of its coordinates.
     offset: int  #: First of three columns of the run's offset.
     clock: Indices  #: Column of the receiver clock error at each row.
     further: Indices  #: Columns of the clock offsets of the other constellations.
-    step: Indices  #: Column of the change of receiver clock error in each step between rows.
+    step: Indices  #: For each step between two rows, the column of the receiver clock's change.
 
     @classmethod
     def from_first(cls, run: SurveyRun, first: int) -> RunColumns:
@@ -113,7 +113,7 @@ def code_equations(
 ) -> Equations:
     """Return the equations of pseudoranges.
 
-    Unknowns are the coordinates, the run's offset, the row's clock error, and a clock offset per other constellation.
+    Unknowns are the coordinates, the run's offset, the row's clock error, and clock offsets of other constellations.
     """
     row, sigma = signals.row, signals.sigma_m
     distance, sight = range_with_rotation(signals.sat_ecef_m, near[row] + origin)
@@ -134,9 +134,9 @@ def code_equations(
 def change_equations(
     signals: RunSignals, columns: RunColumns, near: Floats, origin: Floats, share: Floats, unknowns: int
 ) -> list[Equations]:  # fmt: skip
-    """Return the equations of range changes by carrier phase, and by Doppler where the phase was lost.
+    """Return the equations of range changes from carrier phase or, where the phase was lost, from Doppler.
 
-    Unknowns are the coordinates of both rows, and the change of clock error in each step.
+    Unknowns are the coordinates of both rows, and the change of the clock error between both rows.
     """
     step, sigma = signals.step, signals.change_sigma_m
     before, sight_before = range_with_rotation(signals.before_ecef_m, near[step] + origin)
@@ -158,7 +158,7 @@ def change_equations(
 def _group_medians(value: Floats, group: Indices) -> Floats:
     """Return the median of each value's group.
 
-    The median is an approximate clock error, so that only a small clock error remains to be estimated.
+    Subtracting the median, an approximate clock error, leaves only a small clock error to be estimated.
     """
     order = np.lexsort((value, group))
     first = np.searchsorted(group[order], np.arange(int(group.max(initial=-1)) + 2))
@@ -187,7 +187,7 @@ def motion_equations(
 
 
 def offset_equations(run: SurveyRun, columns: RunColumns, axes: Floats, unknowns: int) -> Equations:
-    """Return the prior of the offset of a run: zero, with the standard deviation of the common error."""
+    """Return the prior of a run's offset: mean 0, and the standard deviation of the common error of all positions."""
     plan, height = run.common_sigma_m
     white = (axes / np.array([plan, plan, height])[:, None])[None]
     parts = _point(np.array([columns.offset]), white)
@@ -200,7 +200,7 @@ def tie_equations(
     line: ReferenceLine, ties: Ties, runs: Sequence[RunColumns], start: int, origin: Floats, limits: SurveyLimits,
     unknowns: int,
 ) -> Equations:  # fmt: skip
-    """Return the equations of passes: a run's distance from the line is an error that is correlated along the line."""
+    """Return the equations of passes, in which a run's distance from the line is an error correlated along the line."""
     share = np.full(len(ties.point), min(1.0, limits.spacing_m / max(limits.correlation_m, 1e-9)))
     white = np.stack([line.across[ties.point], line.up[ties.point]], axis=1) / limits.apart_m
     first = np.array([columns.row[0] for columns in runs])[ties.run]
@@ -216,7 +216,7 @@ def tie_equations(
 
 
 def bend_equations(line: ReferenceLine, start: int, unknowns: int) -> Equations:
-    """Return the pseudo-observations of a smooth line, whose bends differ little from those of the reference line."""
+    """Return the pseudo-observations by which the line bends almost as the reference line does."""
     count = len(line)
     middle = np.arange(count) if line.closed else np.arange(1, count - 1)
     neighbours = line.across[(middle - 1) % count], line.across[(middle + 1) % count]

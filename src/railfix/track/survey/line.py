@@ -1,4 +1,4 @@
-"""Survey of a line: adjustment of several runs with ordinary receivers to one map with standard deviations.
+"""Survey of a line: one map, with standard deviations, by adjustment of several runs with ordinary receivers.
 
 Errors are assumed to follow Student's t distribution, for which the adjustment uses iteratively reweighted least
 squares (Lange, Little and Taylor 1989).
@@ -51,13 +51,13 @@ _COLUMNS: Final = 20  #: Number of columns of the inverse matrix that are comput
 class Adjusted:
     """Result of an adjustment."""
 
-    #: Adjusted positions of each run without the offset of the run, shape (n, 3).
+    #: Adjusted positions of each run, corrected for the run's offset, shape (n, 3).
     ecef_m: tuple[Floats, ...]
-    #: Shifts of the line's points from the reference line, across and upward, shape (J, 2); (0, 2) without a line.
+    #: Shifts of the line's points from the reference line, across and upward, shape (J, 2); (0, 2) without `line`.
     line_m: Floats
     line_sigma_m: Floats  #: Standard deviations of `line_m`, shape (J, 2); (0, 2) if not requested.
-    #: Mean weight of the positions or codes in each row of each run, shape (n,). The weight is about 1 without
-    #: outliers, and 0 without an observation.
+    #: Mean weight of the positions or codes in each row of each run, shape (n,). It is about 1 if the row has no
+    #: outliers, and 0 if it has no observation.
     weight: tuple[Floats, ...]
     scale: tuple[float, ...]  #: Ratio of actual to stated standard deviation of the positions or codes of each run.
 
@@ -74,8 +74,8 @@ def adjust(
 ) -> Adjusted:
     """Adjust the positions of all runs and, if `line` and `ties` are given, the points of the line.
 
-    `near_ecef_m` are approximate positions of each run, shape (n, 3). `repeats` states how often a run passes the
-    position of each row; the weight of the row is divided by this number. With ``sigmas="line"``, `line_sigma_m` is
+    `near_ecef_m` are approximate positions of each run, shape (n, 3). `repeats` states, for each row, how often the run
+    passes the position of the row; the row's weight is divided by it. With ``sigmas="line"``, `line_sigma_m` is
     computed.
     """
     limits = limits or SurveyLimits()
@@ -114,10 +114,10 @@ def adjust(
 
 
 def independent_share(run: SurveyRun, near_m: Floats, limits: SurveyLimits) -> Floats:
-    """Return the weight of each row as a fraction of an independent position, shape (n,).
+    """Return the weight of each row relative to a position with independent error, shape (n,).
 
-    The weight increases with the time and the distance since the previous row. It is 1 from twice the correlation time
-    or length on.
+    The weight increases with the time and the distance since the previous row. It is 1 if the time is at least twice
+    the correlation time, or the distance twice the correlation length.
     """
     since = np.diff(run.seconds, prepend=run.seconds[0] - 2.0 * limits.correlation_s)
     way = np.concatenate([[0.0], np.linalg.norm(np.diff(near_m, axis=0), axis=1)])
@@ -129,7 +129,7 @@ def independent_share(run: SurveyRun, near_m: Floats, limits: SurveyLimits) -> F
 def _solve(
     systems: Sequence[Equations], unknowns: int, limits: SurveyLimits
 ) -> tuple[Floats, list[Floats], list[float]]:
-    """Solve by iterative reweighting; return the solution, and the weights and scale of each of the `systems`."""
+    """Solve by iterative reweighting; return the solution, and for each of the `systems` its weights and scale."""
     weights = [np.ones(len(system.share)) for system in systems]
     scales = [1.0 for _ in systems]
     solution = np.zeros(unknowns)
@@ -210,11 +210,11 @@ def _of_rows(weight: Floats, run: SurveyRun) -> Floats:
     return np.asarray(np.bincount(rows, weights=weight, minlength=len(run)) / np.maximum(count, 1))
 
 
-_ROUNDS: Final = 3  #: Number of adjustments with the line. The passes are searched before each adjustment.
-#: Distance between the passes of both directions beyond which the directions count as separate tracks, in standard
+_ROUNDS: Final = 3  #: Number of adjustments that include the line. The passes are searched before each adjustment.
+#: Passes in opposite directions count as on separate tracks if they are farther apart than this number of standard
 #: deviations of a run's offset. The value is three standard deviations of the difference of two offsets.
 _OTHER_TRACK: Final = 3.0 * 2.0**0.5
-_TURN_M: Final = 40.0  #: Distance over which a reversal is searched [m].
+_TURN_M: Final = 40.0  #: Reversals are found from the directions over half of this, before and after a point [m].
 _END_POINTS: Final = 8  #: Number of points from which the direction at an end of the line is computed.
 _OF_THE_MAP: Final = 95.0  #: The map's accuracy is this percentile of the standard deviations along the line.
 
@@ -294,11 +294,11 @@ def survey_line(runs: Sequence[SurveyRun], *, limits: SurveyLimits | None = None
 
 
 def _unseen_sigma(runs: Sequence[SurveyRun]) -> Floats:
-    """Return additional standard deviations in plan and height for the common error of a single run, shape (2,) [m].
+    """Return standard deviations in plan and height to be added for the common error of a single run, shape (2,) [m].
 
-    Without a second run, the common error is not observable. The addition doubles the effect of
-    `SurveyRun.common_sigma_m`. Without it, the sigmas of single runs with low-cost receivers were half of the actual
-    errors.
+    Without a second run, the common error is not observable. The addition doubles the contribution of
+    `SurveyRun.common_sigma_m` to the standard deviation. Without the addition, sigmas of single runs with low-cost
+    receivers were half of the actual errors.
     """
     return np.sqrt(3.0) * np.array(runs[0].common_sigma_m) if len(runs) == 1 else np.zeros(2)
 
@@ -329,9 +329,9 @@ def _repeats(runs: Sequence[SurveyRun], ties: Ties) -> list[Floats]:
 
 
 def _without_loose_ends(plan_m: Floats) -> slice:
-    """Return the range of points of an open line without end points that do not advance.
+    """Return the range of an open line's points that remains after removal of end points that do not advance.
 
-    Such end points are noise at rest.
+    Such end points are position noise at standstill.
     """
     first, last = 0, len(plan_m)
     spacing = float(np.median(np.linalg.norm(np.diff(plan_m, axis=0), axis=1)))
@@ -347,7 +347,7 @@ def _without_loose_ends(plan_m: Floats) -> slice:
 
 
 def _points_ahead(plan_m: Floats) -> Indices:
-    """Return the indices of points that advance by at least half a spacing; other points are noise at rest."""
+    """Return the indices of points that advance by at least half a spacing; other points are noise at standstill."""
     reach = _END_POINTS // 2
     index = np.arange(len(plan_m))
     way = plan_m[np.minimum(index + reach, len(index) - 1)] - plan_m[np.maximum(index - reach, 0)]
@@ -387,14 +387,14 @@ def _notes(
     beside: float,
     apart: float,
 ) -> tuple[str, ...]:
-    """Return the map's notes on runs, accuracy and gaps."""
+    """Return notes to the user on the runs, the accuracy of the map, and gaps."""
     against = sum(len(each.place) for each in passes if each.sign < 0) / max(sum(len(e.place) for e in passes), 1)
     driven = sum(float(leg.arc_m[-1]) for leg in legs)
     length = float(np.linalg.norm(np.diff(ecef_m, axis=0), axis=1).sum())
     notes = [
         ANTENNA_PATH,
         f"surveyed from {plural(runs, 'run')} of {driven:,.0f} m in total, {driven / length:.1f} times the length of "
-        f"the line, {against:.0%} of the distance against the direction of the line; each point is passed "
+        f"the line; {against:.0%} of this distance was against the direction of the line; each point is passed "
         f"{count.min()} to {count.max()} times",
         f"accuracy of the map {sigma_m[0]:.2f} m in plan and {sigma_m[1]:.2f} m in height (95th percentiles along the "
         f"line)",
@@ -408,14 +408,14 @@ def _notes(
     if len(runs) == 1:
         plan, height = (2.0 * value for value in runs[0].common_sigma_m)
         notes.append(
-            f"one run does not show the error that all its positions share: {plan:.1f} m in plan and {height:.1f} m in "
-            "height are assumed for this error in the accuracy of the map; add runs of other days"
+            f"one run cannot show the error that is common to all its positions: the accuracy of the map includes "
+            f"{plan:.1f} m in plan and {height:.1f} m in height for this error; add runs on other days"
         )
     if beside > 0.02 * driven:
-        notes.append(f"{beside:,.0f} m of the runs are off the line and are not used: branches, or wrong positions")
+        notes.append(f"{beside:,.0f} m of the runs are off the line (branches or wrong positions) and not used")
     if apart:
         notes.append(
-            f"the runs of one direction, {apart:.1f} m beside the runs of the other direction, are assumed to be on "
-            "another track, and are left out; survey each track separately"
+            f"the runs of one direction are {apart:.1f} m beside the runs of the other direction; they are assumed to "
+            "be on another track, and are left out; survey each track separately"
         )
     return tuple(notes)

@@ -14,10 +14,10 @@ from railfix.core.arrays import Floats, Indices, Integers
 from railfix.track.survey.runs import SurveyLimits
 
 _SAME_WAY: Final = 0.7  #: Cosine of the largest angle between two passes of one line.
-#: Minimum distance along a leg between two parts of which one repeats the other, in widths of the line (`same_line_m`).
+#: A part of a leg can repeat an earlier part only if they are this many line widths (`same_line_m`) apart on the leg.
 _APART_WIDTHS: Final = 3.0
-_MOSTLY: Final = 0.8  #: Minimum fraction of the points of a stretch that must fulfil a condition.
-_SEAM_M: Final = 200.0  #: Distance over which the difference of two joined passes is distributed [m].
+_MOSTLY: Final = 0.8  #: Minimum fraction of points that must show a repetition, or another track.
+_SEAM_M: Final = 200.0  #: The offset between two joined passes is distributed over this distance [m].
 _GAP_S: Final = 10.0  #: A longer time without rows is a gap [s].
 #: Longest gap within a leg [m]. At a longer gap, the leg ends.
 BRIDGED_M: Final = 500.0
@@ -36,7 +36,7 @@ class Leg:
     point_m: Floats  #: East, north and up in the frame of the survey, shape (m, 3).
 
     def nodes_at(self, arc_m: Floats) -> tuple[Indices, Floats]:
-        """Return the four rows around each of q arc lengths and their interpolation weights, shape (q, 4) each.
+        """Return the four rows around each of q arc lengths, and the weights of these rows, each of shape (q, 4).
 
         The interpolation is cubic, and linear at the ends of the leg.
         """
@@ -86,8 +86,8 @@ class Pass:
     leg: int  #: Index of the leg.
     sign: int  #: 1 in the direction of the line, -1 in the opposite direction.
     arc_m: Floats  #: Rising arc lengths along the leg, shape (p,).
-    #: Monotone fractional indices of points of the line, shape (p,). On a closed line, they continue beyond the last
-    #: point.
+    #: Places on the line, as monotone fractional indices of its points, shape (p,). On a closed line, they continue
+    #: beyond the last point.
     place: Floats
 
 
@@ -100,10 +100,10 @@ def directions(point_m: Floats, *, closed: bool = False) -> Floats:
 
 
 def find_legs(run: int, point_m: Floats, time_s: Floats, limits: SurveyLimits, turn_m: float) -> list[Leg]:
-    """Divide a run into legs at reversals and at gaps over which the run is not straight.
+    """Divide a run into legs at reversals, and at gaps that are long or at which the direction changes.
 
-    Reversals are searched over the distance `turn_m`. Rows are left out if they are nearer to the previous selected row
-    than the spacing.
+    Reversals are found from the directions over `turn_m` / 2 before and after a point. Rows are left out if they are
+    nearer to the previous selected row than the spacing.
     """
     spacing_m = limits.spacing_m
     rows = [0]
@@ -160,7 +160,8 @@ def _sample(leg: Leg, spacing_m: float) -> tuple[Floats, Floats]:
 def find_course(legs: Sequence[Leg], limits: SurveyLimits) -> Course:
     """Find the course of the line.
 
-    The course begins as the longest leg up to where this leg repeats itself. The remaining legs extend the course.
+    At first, the course is the longest leg, up to the point where this leg begins to repeat itself. The other legs
+    extend the course.
     """
     spacing_m, width_m = limits.spacing_m, limits.same_line_m
     order = sorted(range(len(legs)), key=lambda i: -float(legs[i].arc_m[-1]))
@@ -178,7 +179,7 @@ def find_course(legs: Sequence[Leg], limits: SurveyLimits) -> Course:
 
 
 def _until_repeated(points: Floats, spacing_m: float, width_m: float) -> Course:
-    """Return a polyline up to where it runs parallel to an earlier part of itself for `_APART_WIDTHS`."""
+    """Return a polyline up to where it begins to repeat an earlier part of itself, for at least `_APART_WIDTHS`."""
     least = int(_APART_WIDTHS * width_m / spacing_m)
     way = directions(points)
     tree = cKDTree(points[:, :2])
@@ -202,7 +203,7 @@ def _until_repeated(points: Floats, spacing_m: float, width_m: float) -> Course:
 
 
 def _close_course(points: Floats, end: int, start: int, spacing_m: float) -> Course:
-    """Close the course from point `start` to point `end` at the same location, and distribute the misclosure."""
+    """Close the course between its points `start` and `end`, which are at one location; distribute the misclosure."""
     turn = points[start : end + 1].copy()
     gap = turn[0] - turn[-1]
     along = directions(points)[start]
@@ -328,7 +329,7 @@ def find_passes(course: Course, legs: Sequence[Leg], limits: SurveyLimits) -> tu
 def without_other_track(
     course: Course, legs: Sequence[Leg], passes: Sequence[Pass], limits: SurveyLimits, tolerance_m: float
 ) -> tuple[list[Pass], float]:
-    """Remove the passes of one direction if both directions are on separate tracks.
+    """Remove the passes of one direction if the two directions are on separate tracks.
 
     Tracks are separate if they are more than `tolerance_m` apart. Return the remaining passes and the distance between
     the tracks [m], which is 0 if no passes are removed.
@@ -364,7 +365,7 @@ class Ties:
 
 
 def find_ties(course: Course, legs: Sequence[Leg], passes: Sequence[Pass]) -> Ties:
-    """Interpolate the position of each pass at each point of the line that it passes."""
+    """For each pass, interpolate the run's positions abreast of the points of the line on the pass."""
     parts: list[tuple[Indices, Indices, Floats, Indices, Indices]] = []
     for number, each in enumerate(passes):
         place, arc = each.sign * each.place, each.arc_m

@@ -17,26 +17,25 @@ from railfix.core.timescale import seconds
 from railfix.io.position_log import PositionLog
 from railfix.track.map_from_positions import SIGMA_OF_QUALITY
 
-#: Standard deviations in plan and height of the error that is common to all positions of a run, by RTKLIB quality
-#: number [m]. The common error is due to orbits, ionosphere and reference frame. Averaging over the run does not reduce
-#: it.
+#: For each RTKLIB quality number, standard deviations in plan and height of the error that is common to all positions
+#: of a run [m]. Orbits, ionosphere and reference frame cause this error. Averaging over the run does not reduce it.
 COMMON_SIGMA_OF_QUALITY: Final[Mapping[int, tuple[float, float]]] = MappingProxyType(
     {1: (0.02, 0.04), 2: (0.2, 0.4), 3: (0.5, 1.0), 4: (0.3, 0.6), 5: (1.0, 2.0)}
 )
 _UNKNOWN_QUALITY: Final = 5
-#: Standard deviation of the change of vertical velocity in one second [m/s]; 0.02 to 0.07 m/s for road vehicles.
+#: Standard deviation of the change of vertical velocity in one second [m/s]; it is 0.02 to 0.07 m/s for road vehicles.
 CLIMB_MPS2: Final = 0.05
 
 
 class SurveyLimits(Settings):
     """Assumptions of a survey."""
 
-    interval_s: float = Field(default=1.0, gt=0)  #: Minimum time between two positions; faster logs are thinned.
+    interval_s: float = Field(default=1.0, gt=0)  #: Minimum time between two positions; denser logs are thinned.
     #: Correlation time of position errors.
     correlation_s: float = Field(default=30.0, ge=0)
     correlation_m: float = Field(default=50.0, ge=0)  #: Correlation length of position errors along the path.
-    #: Standard deviation of the change of horizontal velocity per axis in one second. It was 1.2 to 1.8 m/s for three
-    #: road vehicles, computed from changes over 5 s, the duration of curves and braking.
+    #: Standard deviation, per horizontal axis, of the change of velocity in one second. For three road vehicles, it was
+    #: 1.2 to 1.8 m/s, computed from changes over 5 s, which is about the duration of curves and of braking.
     acceleration_mps2: float = Field(default=1.5, gt=0)
     freedom: float = Field(default=3.0, gt=0)  #: Degrees of freedom of Student's t, which down-weights outliers.
     same_line_m: float = option(
