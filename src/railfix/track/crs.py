@@ -142,13 +142,13 @@ HELD: Final = {
 SAME: Final = {
     "NAD83(CSRS)": (
         "EPSG:8254",
-        "its versions 2 to 8 differ by up to 0.03 m in plan where the crust is stable, 0.10 m in height",
+        "its versions 2 to 8 differ by up to 0.03 m in plan where the crust is stable, and 0.10 m in height",
     ),
     "NAD83(HARN)": ("EPSG:6319", "the frames differ by up to 0.1 m, by up to 0.5 m in the west of California"),
     "NAD83(FBN)": ("EPSG:6319", "the frames differ by up to 0.1 m, by up to 0.5 m in the west of California"),
     "NAD83(NSRS2007)": ("EPSG:6319", "the frames differ by 0.02 m, by up to 0.3 m in the west of California"),
-    "RGF93 v2": ("EPSG:7931", "it is this frame at the epoch 2009.0"),
-    "RGF93 v2b": ("EPSG:7931", "it is this frame at the epoch 2019.0"),
+    "RGF93 v2": ("EPSG:7931", "RGF93 v2 is ETRF2000 at the epoch 2009.0"),
+    "RGF93 v2b": ("EPSG:7931", "RGF93 v2b is ETRF2000 at the epoch 2019.0"),
 }
 
 

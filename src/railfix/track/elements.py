@@ -252,7 +252,7 @@ def plan_starts(plan: Sequence[Plan]) -> Floats:
 
 
 def _by_start(place_m: Floats, starts: Sequence[float] | Floats) -> list[tuple[Masks, int]]:
-    """Return, for each element that has distances, the mask of its distances and its index.
+    """Return, for each element on which distances lie, the mask of these distances and the element's index.
 
     A distance belongs to the last element that starts before it, or to the first element.
     """

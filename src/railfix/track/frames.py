@@ -43,7 +43,7 @@ class FrameShift:
     frame: str  #: Name of the map's frame.
     used: str  #: Frame and epoch of the transformed map, and of positions computed with this map.
     method: str  #: Description of the transformation.
-    #: Shift at the middle of the line, to east, north and up.
+    #: Shift of the map at the middle of the line, to east, north and up.
     east_m: float = 0.0
     north_m: float = 0.0
     up_m: float = 0.0

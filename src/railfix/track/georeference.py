@@ -41,7 +41,7 @@ from railfix.track.crs import (
 _UNEVEN: Final = (
     "Popular Visualisation Pseudo Mercator", "Mercator (variant A)", "Mercator (variant B)", "Equidistant Cylindrical",
 )  # fmt: skip
-#: Size of the cells for the choice of an operation; all maps in a cell are transformed by the same operation [deg].
+#: All maps in a cell of this size are transformed by the same operation [deg].
 _CELL_DEG: Final = 0.25
 #: Standard deviation below which a transformation error is negligible compared with the error of a map [m].
 NEGLIGIBLE_M: Final = 0.1
@@ -58,7 +58,7 @@ class Georeference:
     longitude_deg: Floats  #: Longitude, shape (n,).
     frame: str = "EPSG:4979"  #: Geographic CRS of the coordinates.
     operation: str = ""  #: Name of the PROJ operation that changed the datum; "" if the map is in a modern frame.
-    accuracy_m: float = 0.0  #: Standard deviation in plan of the operation; NaN if unknown.
+    accuracy_m: float = 0.0  #: Standard deviation of the operation in plan; NaN if unknown.
     notes: tuple[str, ...] = ()
 
     @property

@@ -31,7 +31,8 @@ _BESIDE_MEDIANS: Final = 6.0  #: The second limit for outliers is this multiple 
 _LEAST_RADIUS_M: Final = 150.0
 _ROUNDS: Final = 20  #: Largest number of searches for outliers. Each search leaves out the outliers found before.
 _ENOUGH: Final = 10  #: Minimum number of positions for a search for outliers.
-#: Largest acceleration of the train. A position's deviation along the line is reduced by what it can cause.
+#: Largest acceleration of the train. A position's deviation along the line is reduced by what this acceleration can
+#: cause.
 _ACCELERATION_MPS2: Final = 2.0
 #: The path between the neighbours of a position counts as straight if both neighbours are within this time [s].
 _NEAR_S: Final = 2.5

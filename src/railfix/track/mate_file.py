@@ -75,7 +75,7 @@ _POSITION: Final = "S_DM_TRACK_SEGMENT_POSITION"
 _GRADIENT: Final = "S_DM_TRACK_SEGMENT_GRADIENT"
 _CANT: Final = "S_DM_TRACK_SEGMENT_CANT"
 _SPAN: Final = ("TRACK_SEGMENT_REFERENCE_POSITION", "TRACK_SEGMENT_LENGTH")
-#: Largest accepted gap between two successive segments of an edge, as computed by `_gap` [m].
+#: A file is rejected if a gap between successive segments of an edge, computed by `_gap`, exceeds this [m].
 _MEETS_M: Final = 0.5
 Row = dict[str, str]
 

@@ -23,7 +23,7 @@ from railfix.track.track import ANOTHER_PLACE_M
 
 #: Standard deviation of distances from the track, if it is neither stated in the log nor can be estimated [m].
 SIGMA_M: Final = 4.0
-_LEAST_SIGMA_M: Final = 1.0  #: Lower bound of the estimated standard deviation of the distance [m].
+_LEAST_SIGMA_M: Final = 1.0  #: Smaller estimates of the positions' standard deviation are replaced by this [m].
 #: Sigma is estimated from positions whose second nearest track is farther than the nearest one by more than this [m].
 _ALONE_M: Final = 15.0
 #: Positions count as off the track if their median distance, scaled to a standard deviation, exceeds both this value
@@ -33,13 +33,13 @@ _BESIDE: Final = 3.0  #: Multiple of the position noise; see `_LARGEST_LEVEL_M`.
 _ENOUGH: Final = 30  #: Minimum number of positions to estimate the standard deviation.
 #: Upper bound of the standard deviation of the common error of all positions (satellites, atmosphere, map) [m].
 _COMMON_M: Final = 2.0
-#: Ratio of the standard deviation of the common error to the stated standard deviation.
+#: Ratio of the common error's standard deviation to the stated standard deviation of the positions.
 _COMMON_SHARE: Final = 0.7
-_BEST: Final = 0.1  #: `_COMMON_SHARE` is relative to this quantile of the stated standard deviations.
+_BEST: Final = 0.1  #: Quantile of the stated standard deviations that is multiplied by `_COMMON_SHARE`.
 _WITHIN_M: Final = 30.0  #: Minimum search distance for tracks [m].
 _WITHIN_SIGMAS: Final = 5.0  #: Search distance for tracks, in standard deviations of the position.
 _FARTHEST_M: Final = 100.0  #: Maximum search distance for tracks [m].
-_FAR: Final = 6.0  #: Factor by which the search distance is larger for positions without a near track.
+_FAR: Final = 6.0  #: The search distance is multiplied by this for positions without a near track.
 #: Positions without a candidate are rejected if the adjacent positions with candidates are at most this time apart [s].
 _WRONG_S: Final = 60.0
 _MOST_FAR: Final = 8  #: Largest number of candidate tracks for a position without a near track.
@@ -48,7 +48,7 @@ _NO_TRACK: Final = {"track": -1, "chainage_m": np.nan, "offset_m": np.inf}
 #: Values in `Matched` for a position that was not matched.
 _NO_MATCH: Final = {"track": -1, **dict.fromkeys(("chainage_m", "offset_m", "probability", "probabilities"), np.nan)}
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.
-_ROUNDED_M: Final = 0.1  #: Tolerance in comparisons of the distance between tracks [m].
+_ROUNDED_M: Final = 0.1  #: Unmapped tracks may be closer to mapped tracks than `CLEARANCE_M` by this [m].
 _STEP_S: Final = 0.4  #: Time step assumed where times are missing or decrease [s].
 _MOST_TRACKS: Final = 16  #: Largest number of candidate tracks for a position.
 #: Heights are used if the candidate tracks of a position differ in height by more than this value [m].
@@ -63,9 +63,9 @@ class PlanLog(RowArrays):
     time: Datetimes
     latitude_deg: Floats
     longitude_deg: Floats
-    sigma_m: Floats  #: Standard deviation per horizontal axis.
+    sigma_m: Floats  #: Standard deviation of a position per horizontal axis.
     height_m: Floats | None = None  #: Height of the antenna; None if the log has no heights.
-    sigma_up_m: Floats | None = None  #: Standard deviation of the height.
+    sigma_up_m: Floats | None = None  #: Standard deviation of the height; None if unknown.
     antenna_up_m: float | None = None  #: Height of the antenna above the rails; None if unknown.
     notes: tuple[str, ...] = ()
 

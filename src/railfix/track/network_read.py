@@ -23,9 +23,9 @@ from railfix.track.route import MapReading, Segment, check_order, first_gap, ori
 from railfix.track.vector_file import CROSSING, read_layers
 from railfix.track.xml_files import Relation, read_railml_relations, read_rinf_relations
 
-TOLERANCE_M: Final = 0.5  #: Ends are connected up to this distance if the file states no connections [m].
-#: Largest change of direction at a connection that a train can pass [rad]. Between the two legs of a switch, the
-#: direction would change by about pi.
+TOLERANCE_M: Final = 0.5  #: Ends closer than this are connected if the file states no connections [m].
+#: A train can pass a connection if the direction changes by less than this [rad]. From one leg of a switch to the other
+#: leg, the direction would change by about pi.
 _LARGEST_TURN_RAD: Final = np.radians(60.0)
 
 
@@ -209,9 +209,9 @@ def _part(track: Segment, way: Floats, low: float, high: float, number: int) -> 
 _GAP_M: Final = 5.0
 #: Connected ends are reported as a joint that does not meet if they are farther apart than this [m].
 _JOINT_M: Final = 0.5
-#: Change of direction at a navigable connection above which a kink is reported [deg]; a 1:4.5 switch turns by 12.5 deg.
+#: Navigable connections that turn by more than this are reported as kinks [deg]; a 1:4.5 switch turns by 12.5 deg.
 _KINK_DEG: Final = 15.0
-#: Spacing of parallel tracks below which vehicles cannot pass each other [m].
+#: Tracks with a smaller spacing are reported, because vehicles on them cannot pass each other [m].
 _LEAST_SPACING_M: Final = 2.5
 #: The spacing of tracks is not checked within this distance of their ends, because tracks join in switches [m].
 _SWITCH_M: Final = 80.0

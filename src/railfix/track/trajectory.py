@@ -90,7 +90,7 @@ def nearest_segments(
     return segment[row, column], share[row, column], best
 
 
-#: Largest distance of a closed line's end from another part of the line [m]; parallel tracks are farther apart.
+#: A line is closed if its end is within this distance of another part of it [m]; parallel tracks are farther apart.
 _CLOSED_M: Final = 3.0
 _SAME_WAY: Final = 0.9  #: Cosine of the largest angle between two parts that count as parallel.
 _END_M: Final = 100.0  #: Parts of the line within this length of its end are not searched [m].
@@ -138,7 +138,7 @@ class Trajectory(FrozenArrays, NotebookTable):
     #: Chainage of the midpoint between the bogies when the antenna is at the point, strictly rising, shape (V,). It
     #: relates the positions of two antennas on one vehicle. It is None without a vehicle.
     body_chainage_m: Floats | None = None
-    facing: Literal["rising", "falling"] = "rising"  #: Direction of the vehicle's front along the line.
+    facing: Literal["rising", "falling"] = "rising"  #: Whether the front points to rising or falling chainage.
     #: Distance of the antenna ahead of the midpoint between the bogies, toward the vehicle's front.
     antenna_ahead_m: float = 0.0
     #: Distance from the midpoint between the bogies to the vehicle's front end; None if unknown.

@@ -25,7 +25,7 @@ _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 #: Number of intervals for the numerical integration of the length. With 12 nodes in each interval, the length is exact
 #: except for rounding errors.
 _PIECES: Final = 16
-_ROUNDS: Final = 30  #: Number of fixed-point iterations for the length on the tangent; ten are enough to converge.
+_ROUNDS: Final = 30  #: Number of fixed-point iterations for the length X; ten are enough to converge.
 _HALF_SINE_END: Final = 0.25 - 1.0 / np.pi**2  #: Value of y R / X^2 at the end of a half-sine.
 
 

@@ -28,8 +28,8 @@ Reference = Literal["antenna", "centre", "front_bogie", "rear_bogie"]
 #: Distance between the contact points of an axle's wheels, minus the gauge; about the width of a rail head [m].
 RAIL_HEAD_M: Final = 0.070
 PATH_TOLERANCE_M: Final = 0.004  #: Largest deviation of the antenna's path from the chord between two points [m].
-_INNER: Final = np.array([0.25, 0.5, 0.75])  #: Fractions of a segment at which the chord is compared with the path.
-#: Shortest segment of the path [m].
+_INNER: Final = np.array([0.25, 0.5, 0.75])  #: Fractions of a segment where chord and antenna path are compared.
+#: Shortest segment of the antenna's path [m].
 _SHORTEST_M: Final = 0.25
 _MAX_ITERATIONS: Final = 200
 _CONVERGED_M: Final = 1e-7  #: Iterations end when the result changes by less than this value [m].
@@ -52,8 +52,8 @@ class Vehicle(Settings):
     bogie_distance_m: float = Field(gt=0.5, le=30.0)  #: Straight distance between the two bogie centres.
     #: Track gauge. Cant is measured over the distance between the contact points, the gauge plus `RAIL_HEAD_M`.
     gauge_m: float = Field(default=1.067, ge=0.5, le=2.0)
-    facing: Literal["rising", "falling"] = "rising"  #: Direction of the vehicle's front along the chainage.
-    #: Length over the ends (buffers or couplers); None where unknown.
+    facing: Literal["rising", "falling"] = "rising"  #: Whether the front points to rising or falling chainage.
+    #: Length of the vehicle over buffers or couplers; None if unknown.
     length_m: float | None = Field(default=None, gt=0.0, le=1000.0)
     #: Distance from the midpoint between the bogies to the front end; if None, half of `length_m`.
     front_end_m: float | None = Field(default=None, ge=0.0, le=1000.0)
@@ -101,7 +101,7 @@ class Body:
     lower_m: Floats  #: Lower of the chainages of the two bogie centres, shape (n,).
     upper_m: Floats  #: Higher of the chainages of the two bogie centres, shape (n,).
     origin: Floats  #: ECEF position midway between the bogie centres, shape (n, 3) [m].
-    #: Unit vectors of the body axes in ECEF, shape (n, 3).
+    #: Unit vectors in ECEF along the body's axes forward, right and up, shape (n, 3) each.
     forward: Floats
     right: Floats
     up: Floats

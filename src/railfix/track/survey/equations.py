@@ -50,9 +50,9 @@ class RunColumns:
     """Columns of the unknowns of one run."""
 
     row: Indices  #: For each row of the run, the first of the three columns of its coordinates.
-    offset: int  #: First of three columns of the run's offset.
+    offset: int  #: First of the three columns of the run's offset.
     clock: Indices  #: Column of the receiver clock error at each row.
-    further: Indices  #: Columns of the clock offsets of the other constellations.
+    further: Indices  #: Columns of the clock offsets of groups 1, 2, ... (`RunSignals.clock`).
     step: Indices  #: For each step between two rows, the column of the receiver clock's change.
 
     @classmethod

@@ -23,7 +23,7 @@ _GAP_S: Final = 10.0  #: A longer time without rows is a gap [s].
 BRIDGED_M: Final = 500.0
 #: Cosine of the largest change of direction over a gap within a leg. At a larger change, the leg ends.
 _GOES_ON: Final = 0.9
-_NEIGHBOURS: Final = 24  #: Number of nearest vertices that are compared with a point.
+_NEIGHBOURS: Final = 24  #: Number of nearest points of the line that are compared with a point.
 
 
 @dataclass(frozen=True, kw_only=True)

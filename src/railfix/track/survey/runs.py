@@ -62,17 +62,17 @@ class SurveyLimits(Settings):
 class RunSignals(FrozenArrays):
     """Observations of a run: M pseudoranges, and C range changes between successive rows."""
 
-    row: Indices  #: Row of the run, shape (M,).
+    row: Indices  #: Row of the run at which each pseudorange was measured, shape (M,).
     sat_ecef_m: Floats  #: Position of the satellite at transmission, shape (M, 3).
     code_m: Floats  #: Corrected pseudorange, shape (M,).
     sigma_m: Floats  #: Standard deviation of the pseudorange, shape (M,).
-    clock: Indices  #: Index of the receiver clock, shape (M,).
-    step: Indices  #: Row at which each change begins; the change ends at the next row; shape (C,).
-    before_ecef_m: Floats  #: Satellite position at transmission, for the row at which the change begins, shape (C, 3).
-    after_ecef_m: Floats  #: Satellite position at transmission, for the row at which the change ends, shape (C, 3).
+    clock: Indices  #: Group of constellations with one clock offset, numbered from 0, shape (M,).
+    step: Indices  #: Row at which each range change begins; it ends at the next row; shape (C,).
+    before_ecef_m: Floats  #: Satellite position at transmission, for the first row of the range change, shape (C, 3).
+    after_ecef_m: Floats  #: Satellite position at transmission, for the last row of the range change, shape (C, 3).
     change_m: Floats  #: Change of the range, from carrier phases or Dopplers, shape (C,).
-    change_sigma_m: Floats  #: Standard deviation of the change, shape (C,).
-    by_doppler: Masks  #: Whether the change was computed from Dopplers, shape (C,).
+    change_sigma_m: Floats  #: Standard deviation of the range change, shape (C,).
+    by_doppler: Masks  #: Whether the range change was computed from Dopplers, shape (C,).
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,10 +82,10 @@ class SurveyRun(FrozenArrays):
     name: str
     time: Datetimes  #: Times of the rows, strictly rising, shape (n,).
     ecef_m: Floats  #: Positions, shape (n, 3); NaN without a position.
-    sigma_m: Floats  #: Standard deviations east, north and up, shape (n, 3).
+    sigma_m: Floats  #: Standard deviations of the positions, east, north and up, shape (n, 3).
     #: Observations from which the positions were computed. If given, they are adjusted instead of the positions.
     signals: RunSignals | None = None
-    #: Standard deviations in plan and height of the error that is common to all positions.
+    #: Standard deviations in plan and height of the error that is common to all positions of the run.
     common_sigma_m: tuple[float, float] = COMMON_SIGMA_OF_QUALITY[_UNKNOWN_QUALITY]
 
     def __post_init__(self) -> None:
