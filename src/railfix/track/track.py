@@ -37,7 +37,7 @@ class Provenance:
     crs: str = "EPSG:4979"  #: Coordinate reference system of the files; `UNNAMED` if the files do not name it.
     frame: str = "EPSG:4979"  #: Geographic CRS of the coordinates of the track; see `railfix.track.frames`.
     height_datum_asked: str = ""  #: Height datum given by the user, "ellipsoidal" or "orthometric"; "" if not given.
-    height_datum_used: str = "ellipsoidal"  #: Height datum that was used.
+    height_datum_used: str = "ellipsoidal"  #: Height datum with which the heights were read.
     geoid: str = ""  #: Geoid model by which orthometric heights were converted to ellipsoidal heights; "" if not used.
     notes: tuple[str, ...] = ()  #: Notes that are copied to every result computed with this map.
 

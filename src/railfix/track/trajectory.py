@@ -104,7 +104,7 @@ def joins_m(arc_m: Floats, ecef_m: Floats) -> tuple[float, float]:
 
 
 def _beside(arc_m: Floats, ecef_m: Floats, segment: Floats, end: int) -> float:
-    """Return the arc length of the nearest part of the line that is parallel to an end [m]; NaN without one."""
+    """Return the arc length of the nearest part of the line that is parallel to an end [m]; NaN if none is."""
     from_end = ecef_m[end] - ecef_m[:-1]
     length = np.diff(arc_m)
     along = np.clip((from_end * segment).sum(axis=1), 0.0, length)

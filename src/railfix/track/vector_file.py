@@ -2,7 +2,7 @@
 
 OpenStreetMap ways are recognised by their ids and tags (https://wiki.openstreetmap.org/wiki/Key:railway). Export
 programs write the tags as columns, as an object or JSON text (`tags`), as hstore text (`other_tags` of GDAL), or as a
-class (`fclass` in the shapefiles of Geofabrik). They write the id in many forms.
+class (`fclass` in the shapefiles of Geofabrik). These programs write the id in many forms.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from railfix.track.georeference import georeference
 from railfix.track.heights import check_height_datum, heights_of_file
 from railfix.track.route import MapReading, Segment, make_segment
 
-#: Assumed standard deviation in plan of OpenStreetMap tracks, which are drawn from aerial images [m].
+#: Assumed standard deviation in plan [m] of OpenStreetMap tracks, which are drawn from aerial images.
 SIGMA_M: Final = 2.0
 ORIGIN: Final = {"origin": "OpenStreetMap"}  #: Metadata entry of a segment from OpenStreetMap.
 #: Values of the tag `railway` for tracks in use.

@@ -187,7 +187,7 @@ def _graph(path: FilePath) -> Graph:
 
 @lru_cache(maxsize=2)
 def _parse(path: str, _: str) -> Graph:
-    """Return the triples of a file. They are cached because segments and relations are read in separate calls."""
+    """Return the triples of a file, which are cached because segments and relations are read in separate calls."""
     with needs_extra(f"{path}: RDF"):
         from rdflib import Graph
     data = read_bytes(path)

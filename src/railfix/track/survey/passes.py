@@ -86,8 +86,8 @@ class Pass:
     leg: int  #: Index of the leg.
     sign: int  #: 1 in the direction of the line, -1 in the opposite direction.
     arc_m: Floats  #: Rising arc lengths along the leg, shape (p,).
-    #: Places on the line, as monotone fractional indices of its points, shape (p,). On a closed line, they continue
-    #: beyond the last point.
+    #: Places on the line, as monotone fractional indices of its points, shape (p,). On a closed line, the indices
+    #: continue beyond the last point.
     place: Floats
 
 
