@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -25,7 +26,7 @@ from railfix.ground.supervision import Supervision, is_obeyed
 from railfix.ground.triangle import STOPPING, MonitorLimits, MonitorState, TriangleVerdict, advance, release
 from railfix.ground.triangle import Order as MonitorOrder
 from railfix.ground.web import Order
-from railfix.ground.writer import Commits
+from railfix.ground.writer import Commits, ThreadWriter
 from railfix.io.train_message import MessageError, SuspectedInterference, TrainMessage, decode
 
 #: Name of the stored document that contains the cause of a stop.
@@ -238,10 +239,7 @@ class ControlCentre:
         authorities = self.supervision.work(now)
         self._note_routes()
         self._pass_time(now)
-        state, records = self.supervision.state, self.supervision.records
-        cause = "" if self.monitor is None or self.monitor.cause is None else self.monitor.cause.name
-        changed = [record for n, record in records.items() if self._saved_sequences.get(n) != record.sequence]
-        documents = {**to_documents(state, self._saved), _CAUSE: cause}
+        state, (changed, save) = self.supervision.state, self._unsaved()
 
         def then() -> None:
             self._saved = state
@@ -250,8 +248,20 @@ class ControlCentre:
             for authority in authorities:
                 self._send(authority)
 
-        self.commits.begin(partial(self.store.save, *changed, documents=documents), then, now)
+        self.commits.begin(save, then, now)
         self.settle()
+
+    def _unsaved(self) -> tuple[list[TrainRecord], Callable[[], None]]:
+        """Return the records that have changed since the last commit, and the function that saves all changes."""
+        records = self.supervision.records.items()
+        changed = [record for n, record in records if self._saved_sequences.get(n) != record.sequence]
+        cause = "" if self.monitor is None or self.monitor.cause is None else self.monitor.cause.name
+        documents = {**to_documents(self.supervision.state, self._saved), _CAUSE: cause}
+        return changed, partial(self.store.save, *changed, documents=documents)
+
+    def save_last(self, writer: ThreadWriter) -> Future[None]:
+        """Queue a last commit without messages, because orders to brake do not wait for the commit of their stop."""
+        return writer.submit(self._unsaved()[1])
 
     def settle(self) -> None:
         """Send messages whose commit is complete, and log when the database fails or recovers."""

@@ -257,7 +257,10 @@ async def run_centre(
             await links.stop()
             for server in servers:
                 await server.stop()
+            last = control.save_last(writer)
             store.abandoned = not writer.stop(ENDING_S)
+            if last.done():
+                last.result()  # an error of the database
         return terminated.is_set(), {
             "reports used": control.reports,
             "routes set": control.supervision.routes_set,
