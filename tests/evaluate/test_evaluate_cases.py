@@ -551,8 +551,7 @@ def test_the_command_writes_every_table(tmp_path: Path):
     assert "By configuration, runs combined" in result.output
     assert re.search(r"\d more tables: --verbose", result.output)
     assert "By speed" not in result.output
-    verbose = CliRunner().invoke(app, [*arguments, "--verbose", "--overwrite"]).output
-    assert "By speed" in verbose
+    assert "By speed" in CliRunner().invoke(app, [*arguments, "--verbose", "--overwrite"]).output
     written = json.loads((tmp_path / "out" / "evaluation.json").read_text())
     assert {entry["input"] for entry in written["inputs"]} == {"positions", "record", "reference"}
     for entry in written["inputs"]:

@@ -120,10 +120,8 @@ def granted(end_m: float, *, direction: int = 1, **changes: object) -> OnBoard:
 def test_a_train_over_its_curve_is_braked_and_says_by_how_much_it_overruns() -> None:
     train = granted(1000.0)
     train.note_position(900.0, 40.0)
-    assert (
-        train.brake_reason(1.0)
-        == "40.0 m/s exceeds 8.4 m/s, the limit for 0.0 m/s at 1000 m; it would stop 1781 m beyond its authority"
-    )
+    text = "40.0 m/s exceeds 8.4 m/s, the limit for 0.0 m/s at 1000 m; it would stop 1781 m beyond its authority"
+    assert train.brake_reason(1.0) == text
     train.note_position(1500.0, 60.0)
     assert "60.0 m/s exceeds 0.0 m/s" in (train.brake_reason(1.0) or "")
     train = granted(1000.0)

@@ -138,7 +138,6 @@ def test_a_killed_centre_keeps_what_its_trains_know(folder: Path, tmp_path: Path
             with Store(f"sqlite:///{database}") as store:
                 stored, state = store.records()[1], from_documents(store.documents(HEAD))
                 last = store.log(last=10_000)
-            # orders to brake do not wait for a commit
             known = [authority for authority in newest if not isinstance(authority, BrakeOrder)][-1]
             assert stored.sequence >= known.report
             assert stored.sequence in sent

@@ -97,9 +97,7 @@ RULES: dict[str, list[Replaced]] = {
     "points detected": [
         (interlocking, "leads", lambda point, train, k: train.train in point.locked and point.wanted == train.tracks[k])
     ],
-    "persistence": [
-        (DisturbedTraffic, "restored", lambda self: without_grants(self._stored or self.centre.state)),
-    ],
+    "persistence": [(DisturbedTraffic, "restored", lambda self: without_grants(self._stored or self.centre.state))],
     "supervision": [(SimulatedTrain, "permitted_mps", up_to_the_end), (OnBoard, "curve_reason", nothing)],
     "closed": [(interlocking, "bars_ahead", lambda *_: []), (interlocking, "barred", nothing)],
     "freshness": [(OnBoard, "stale_reason", nothing)],

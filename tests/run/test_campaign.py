@@ -100,8 +100,7 @@ def test_a_failed_run_is_a_row_and_a_campaign_goes_on_where_it_was(folder: Path,
     for options in ("[options]\nend = 2024-03-05T03:10:05", 'config = "settings.toml"\n[options]'):
         changed.write_text(CAMPAIGN.replace("[options]", options))
         position(changed)
-        assert record.stat().st_mtime_ns != before
-        before = record.stat().st_mtime_ns
+        assert before != (before := record.stat().st_mtime_ns)
 
 
 @pytest.mark.slow

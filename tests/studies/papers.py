@@ -87,8 +87,8 @@ def document() -> str:
         lines += ["", f"## {paper}: {title}", ""]
         for item in (item for item in DATA["item"] if item["paper"] == paper):
             lines.append("- " + CHAPTER.sub(r"**\g<0>**", item["what"]))
-            lines += [f"  - Paper: {item['asked']}"] if "asked" in item else []
-            lines += [f"  - railfix: {reached(item)}"] if reached(item) else []
+            values = {"Paper": item.get("asked"), "railfix": reached(item)}
+            lines += [f"  - {name}: {value}" for name, value in values.items() if value]
             lines.append(f"  - Provided by: {item['by']} (`{item['where']}`)")
             lines.append(f"  - Test: `{item['test']}`" if "test" in item else "  - Test: **open**")
     lines += ["", "## Where we read the papers differently", ""]
@@ -115,10 +115,8 @@ def _largest() -> str:
 
 
 def _rate() -> str:
-    cells = [
-        f"{figures('corrected', 'ways without tunnels', f'G       {name}, SBAS')[0]} % ({name})" for name in SINGLE
-    ]
-    return ", ".join(cells)
+    rows = {name: figures("corrected", "ways without tunnels", f"G       {name}, SBAS") for name in SINGLE}
+    return ", ".join(f"{row[0]} % ({name})" for name, row in rows.items())
 
 
 def _table_4(*names: str) -> str:
@@ -141,9 +139,7 @@ def _seeds() -> str:
 def _p4() -> str:
     text = (paths.ROOT / "tests" / "references" / "results" / "p4-experiment.txt").read_text(encoding="utf-8")
     cells = next(line for line in text.splitlines() if line.startswith("ESBC, GPS       0.0")).split()
-    return (
-        f"the p95 is {cells[9]} m in east and {cells[12]} m in north; with least squares, {cells[-2]} and {cells[-1]} m"
-    )
+    return f"the p95 is {cells[9]} m east and {cells[12]} m north; with least squares, {cells[-2]} and {cells[-1]} m"
 
 
 #: Figures that kept outputs hold.

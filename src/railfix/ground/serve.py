@@ -257,16 +257,22 @@ async def run_centre(
             await links.stop()
             for server in servers:
                 await server.stop()
-            last = control.save_last(writer)
-            store.abandoned = not writer.stop(ENDING_S)
-            if last.done():
-                last.result()  # an error of the database
+            store.abandoned = not _save_and_stop(control, writer)
         return terminated.is_set(), {
             "reports used": control.reports,
             "routes set": control.supervision.routes_set,
             "reports rejected": dict(control.rejected),
             "frames rejected": {threat.value: n for threat, n in sorted(links.threats().items(), key=str) if n},
         }
+
+
+def _save_and_stop(control: ControlCentre, writer: ThreadWriter) -> bool:
+    """Commit the last state and stop the writer; return whether it has stopped in time. Raise DatabaseError."""
+    last = control.save_last(writer)
+    stopped = writer.stop(ENDING_S)
+    if last.done():
+        last.result()
+    return stopped
 
 
 async def _run_until(

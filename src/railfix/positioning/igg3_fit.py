@@ -93,7 +93,7 @@ def robust_on_line(
     near_ecef_m: Floats | None = None,
     limits: RobustFitLimits | None = None,
 ) -> RobustFit:
-    """Find the ranges that agree with each other at positions on the line (`robust_fit`).
+    """Find the ranges that agree at positions on the line, by IGG-III weights (Yang, Song and Xu, 2002).
 
     Without a position, ranges are linearised at `near_ecef_m`, shape (T, 3) [m]; default: the middle of the line.
     """
