@@ -1,8 +1,8 @@
 """Compilation with numba, and cache of the machine code on disk.
 
 The cache is in ``NUMBA_CACHE_DIR`` if it is set, otherwise in the source folder, or in the user's cache folder if the
-source folder is not writable. numba recompiles a function only when the file of this function changes.
-`_remove_outdated` therefore checks the files of called functions.
+source folder is not writable. numba recompiles a function only when the file that defines the function changes.
+`_remove_outdated` therefore also checks the files of the functions that a function calls.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def inlined(function: Function) -> Function:
 
 @cache
 def _files(package: Path, module: str) -> set[Path]:
-    """Return the files of a module or subpackage of this package, and the files of this package that it imports."""
+    """Return the files of a module or subpackage, and all files of `railfix.kernels` that these files import."""
     path = package / f"{module.replace('.', '/')}.py"
     if not path.exists():
         return set(path.with_suffix("").glob("*.py"))
@@ -91,7 +91,7 @@ def _files(package: Path, module: str) -> set[Path]:
 
 @cache
 def _tuples(package: Path) -> bytes:
-    """Return the names of all named tuples by file; numba cannot load cached code for a tuple class that has moved."""
+    """Return the named tuples of each file; numba cannot load cached code for a tuple class that changed its file."""
     named = re.compile(rb"^class \w+\(NamedTuple\)", re.MULTILINE)
     files = ((path, named.findall(path.read_bytes())) for path in sorted(package.parent.rglob("*.py")))
     return b"\n".join(
@@ -101,7 +101,7 @@ def _tuples(package: Path) -> bytes:
 
 @cache
 def compute_stamp(package: Path, module: str) -> str:
-    """Return a hash of the source files, constants and names of tuples on which a module's machine code depends."""
+    """Return a hash of the source files, constants and named tuples on which a module's machine code depends."""
     files = [*sorted(_files(package, module)), package.parent / "core" / "constants.py"]
     return hashlib.sha256(b"".join([*(path.read_bytes() for path in files), _tuples(package)])).hexdigest()
 

@@ -27,7 +27,7 @@ from railfix.kernels.level_equations import (
 
 
 class _Tails(NamedTuple):
-    """Offset, sigma and weight of the error for K hypotheses, shape (T, K); separation over threshold, shape (K,)."""
+    """Offset and sigma of the error, and weight of K hypotheses, shape (T, K); separation / threshold, shape (K,)."""
 
     offset: Floats
     sigma: Floats
@@ -36,13 +36,13 @@ class _Tails(NamedTuple):
 
 
 class _Work(NamedTuple):
-    """Work arrays for the hypotheses with one shared fault (base), and with further faulty channels.
+    """Work arrays for the hypothesis with one shared fault (base), and for those that add faulty channels to it.
 
-    `member` are the channels of the base, shape (n,), and `rows` the system without them, shape (n + 4, n). `others`
-    are the fault priors of the other channels, shape (n,). `removed` is the effect of the base, shape (4,). `single`
-    and `own` are work space, shape (n,). The other fields are indexed by the number of further excluded channels:
-    system `reduced` without these channels, shape (2, n + 4, n), effect `taken`, shape (3, 4), and, with shape (3,),
-    the flag `undetectable`, the next channel `start`, the output index `place`, and the `product` of priors.
+    `member` are the channels of the base, shape (n,), and `rows` the system without the base, shape (n + 4, n).
+    `others` are the fault priors of the other channels, shape (n,). `removed` is the effect of excluding the base,
+    shape (4,). `single` and `own` are work space, shape (n,). The first index of the other fields is the number of
+    further excluded channels: `reduced`, shape (2, n + 4, n), is the system and `taken`, shape (3, 4), the effect; the
+    flag `undetectable`, next channel `start`, output index `place` and `product` of priors have shape (3,).
     """
 
     member: Masks
@@ -69,7 +69,7 @@ class _Sets(NamedTuple):
 
 @inner
 def _downdate(rows: Floats, member: Masks, every: bool, limit: float, work: Floats, removed: Floats) -> bool:
-    """Exclude the channels `member` one after another; return True if their fault is undetectable.
+    """Exclude the channels `member` one after another; return True if a fault of all of them is undetectable.
 
     The effect of the channels is written to `removed`, and the remaining system to `work`. The rows of channels in
     `work` are complete only if `every` is True.
@@ -111,7 +111,7 @@ def _with_each_later(
 ) -> None:
     """Write the results of excluding channel i and one later channel from the system `rows`, for each later channel.
 
-    `removed` and `undetectable` describe the channels that were excluded before.
+    `removed` and `undetectable` describe the channels that are already excluded.
     """
     n, own, limit = rows.shape[1], ranges.own, common[LIMIT]
     offset, sigma, ratio = sets.offset, sets.sigma, sets.ratio
@@ -207,7 +207,7 @@ def _write_base(
     work: _Work,
     tails: _Tails,
 ) -> None:
-    """Write the hypotheses of base `at` (epoch, base): the shared fault alone, and with further faulty channels."""
+    """Write the hypotheses at `at` (epoch, base): the shared fault alone, and combined with further faulty channels."""
     (t, base), n, rows = at, len(channels.root), system.rows
     order, first, prior = asked.order[t, base], asked.first[base], asked.shared_prior[t, base]
     some = False
@@ -223,7 +223,7 @@ def _write_base(
         rows = work.rows
     more = of_ranges(rows[n], ranges) if ranges.any else (0.0, 0.0, 0.0)
     _write_one(t, first[0], work.removed, more, undetectable, system.common, tails)
-    tails.weight[t, first[0]] = prior * (2.0 if first[0] == 0 else 1.0)  # two-sided: noise of either sign
+    tails.weight[t, first[0]] = prior * (2.0 if first[0] == 0 else 1.0)  # noise has either sign
     if order > 0:
         _write_singles(t, first[1], System(rows, system.common), ranges, undetectable, work, tails)
         for i in range(n):
@@ -276,7 +276,7 @@ def _write_singles(
 
 @inner
 def _write_together(t: int, order: int, system: System, ranges: RangeErrors, work: _Work, tails: _Tails) -> None:
-    """Write the hypotheses with two and more further channels; the last two are excluded together."""
+    """Write the hypotheses with two or more further channels; the last two are excluded in one step."""
     n, limit, depth = len(work.own), system.common[LIMIT], 0
     while depth >= 0:
         i = work.start[depth]

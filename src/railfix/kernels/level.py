@@ -10,15 +10,15 @@ import numpy as np
 from railfix.core.arrays import Codes, Floats, Indices
 from railfix.kernels.compiling import inner, kernel
 
-#: Relative size of the last step, after which the level is exact to 1e-6.
+#: The iteration ends if the next step is at most this fraction of the level, which is then exact to 1e-6.
 _CLOSE = 5e-4
-#: Largest number of steps; without convergence, the lowest level within the risk is used.
+#: Largest number of steps; without convergence, the lowest level found at which the tails are within the risk is used.
 _STEPS = 60
 #: From this step on, every second step bisects the bracket, because steps can alternate between two levels.
 _HALVING = 8
 #: Fraction of the risk that is not used.
 _AIM = 0.002
-#: Relative difference below which two required levels count as equal; the first hypothesis is then reported.
+#: Relative difference up to which required levels count as equal; of these, the first hypothesis is reported as worst.
 _ALIKE = 1e-9
 #: a and b: for x >= 0, the Mills ratio is ``1 / ((1 - a) x + a sqrt(x^2 + b))`` to 0.3 % (Borjesson, Sundberg 1979).
 _MILLS = (0.339, 5.510)
@@ -44,7 +44,7 @@ _E = tuple(1.0 / math.factorial(k) for k in range(12))
 
 @inner
 def _mills(x: float) -> float:
-    """Return the Mills ratio at x >= 0, which is the Gaussian tail divided by the density."""
+    """Return the Mills ratio (Gaussian tail divided by density) at x >= 0."""
     y = x * _ROOT_HALF
     p = (((((((_P[0] * y + _P[1]) * y + _P[2]) * y + _P[3]) * y + _P[4]) * y + _P[5]) * y + _P[6]) * y + _P[7]) * y
     q = (((((((_Q[0] * y + _Q[1]) * y + _Q[2]) * y + _Q[3]) * y + _Q[4]) * y + _Q[5]) * y + _Q[6]) * y + _Q[7]) * y
@@ -90,8 +90,8 @@ def _quantile(probability: float) -> float:
 
 
 class _Room(NamedTuple):
-    """Work space of an epoch. Fields of hypotheses, shape (K,), are inverse sigma, weight (0 if undetectable), required
-    level, distance z to the level in sigmas, exp(-z^2/2) and tail. `of_kind` is the sum of tails per kind.
+    """Work space of an epoch. With a value per hypothesis, shape (K,): inverse sigma, weight (0 if undetectable),
+    required level, distance z to the level in sigmas, exp(-z^2/2) and tail. `of_kind` is the sum of tails per kind.
     """
 
     inverse: Floats
@@ -110,9 +110,9 @@ def solve_level(
 ) -> tuple[Floats, Codes, Floats, Floats, Indices]:
     """Find the level L at which the sum of ``weight Q((L - offset)/sigma)`` over all hypotheses is within the risk.
 
-    Undetectable faults use risk equal to their weight; detectable faults use the remaining risk. If each kind of
-    hypothesis may use its `share`, it requires a certain level. The largest of these levels is lowered until the sum of
-    the tails reaches 0.998 of the remaining risk.
+    The weights of undetectable faults are subtracted from the risk; detectable faults use the remaining risk. For each
+    kind of hypothesis, the level is computed at which the kind uses its `share`. The largest of these levels is lowered
+    until the sum of the tails reaches 0.998 of the remaining risk.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ def solve_level(
         Level ``offset + k sigma`` that each kind requires. If the total weight of a kind is within its `share`, the
         level is 0, and k is -inf.
     worst : ndarray of int, shape (T, kinds)
-        Index, within its kind, of the hypothesis that requires `part_m`; -1 without such a hypothesis.
+        Index, within its kind, of the hypothesis that requires `part_m`; -1 if there is none.
     """
     (epochs, width), kinds = weight.shape, len(bounds) - 1
     level, spender = np.zeros(epochs), np.zeros(epochs, dtype=np.int8)
@@ -168,7 +168,7 @@ def solve_level(
 def _require(
     offset: Floats, sigma: Floats, prior: Floats, checked: Floats, share: float, required: Floats
 ) -> tuple[float, float, float, int]:
-    """Return for one kind the remaining risk, k, the largest required level, and the hypothesis that requires it."""
+    """For one kind, return the remaining risk, k, the largest required level, and the hypothesis that requires it."""
     total, whole = 0.0, 0.0
     for m in range(len(prior)):
         total += checked[m]
@@ -195,7 +195,7 @@ def _require(
 
 @inner
 def _lower(offset: Floats, bounds: Indices, highest: float, aim: float, room: _Room) -> tuple[float, int]:
-    """Return the level at which the tails sum to `aim`, found from `highest` on, and the kind with the largest sum."""
+    """From `highest` on, find the level at which the tails sum to `aim`, and the kind that has the largest sum."""
     level, spender, here, below, above = highest, 0, highest, 0.0, highest
     for number in range(_STEPS):
         _write_tails(offset, here, number == 0, room)
@@ -219,7 +219,7 @@ def _lower(offset: Floats, bounds: Indices, highest: float, aim: float, room: _R
 
 @inner
 def _write_tails(offset: Floats, level: float, roughly: bool, room: _Room) -> None:
-    """Write the tail of each hypothesis beyond a level, weight times Q; with `roughly`, Q is exact to 0.3 % only."""
+    """Write the tail (weight times Q) of each hypothesis beyond a level; if `roughly`, Q is exact to 0.3 % only."""
     for m in range(len(offset)):
         room.z[m] = (offset[m] - level) * room.inverse[m]
     _bells(room.z, room.bits, room.bell)

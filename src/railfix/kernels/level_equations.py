@@ -14,9 +14,9 @@ from railfix.kernels.compiling import inner
 _NO_EFFECT = 1e-6
 #: Smallest separation, as a fraction of sigma; smaller separations are taken as zero.
 _SAME = 1e-9
-#: Entries of `System.common`: squared noise scale, variance along the line, response of the position to map errors
-#: across and up, mean map errors across and up, false-alarm threshold in sigmas, smallest tested threshold, 1 for
-#: equations without the map, displacement of the position without the map, smallest gain with an effect.
+#: Indices in `System.common`: squared noise scale; variance along the line; response of the position to map errors
+#: across, and up; mean map error across, and up; false-alarm threshold in sigmas; smallest tested threshold; 1 if the
+#: equations exclude the map, else 0; displacement of the position without the map; smallest relevant gain.
 _NOISE, _VARIANCE, _MAP_ACROSS, _MAP_UP, _BIAS_ACROSS, _BIAS_UP, _K, _LEAST, _FREE, _SHIFT, LIMIT = range(11)
 
 
@@ -24,22 +24,22 @@ class Channels(NamedTuple):
     """Contiguous arrays of one epoch's channels, shape (n,), with channels in use first and zeros for the others."""
 
     number: Indices  #: Index of each channel in the model.
-    root: Floats  #: Root of the weight [1/m].
+    root: Floats  #: Square root of the weight [1/m].
     clock: Indices
     along: Floats  #: Whitened design.
     across: Floats
     up: Floats
     prior: Floats  #: Prior fault probability of each channel.
     bias: Floats  #: Whitened mean error.
-    beyond: Floats  #: Whitened variance in addition to the noise.
-    shared: Floats  #: Whitened covariance of each two channels due to clocks, shape (n, n).
+    beyond: Floats  #: Whitened variance of errors other than the noise.
+    shared: Floats  #: Whitened covariance of each pair of channels due to clocks, shape (n, n).
 
 
 class System(NamedTuple):
     """Equations of one epoch.
 
-    `rows`, shape (n + 4, n), is the projector of the channels, followed by the rows of gains, residuals, and responses
-    to map errors across and up. `common`, shape (11,), has the values common to all channels.
+    `rows`, shape (n + 4, n), is the projector of the channels, followed by one row each of gains, residuals, and
+    responses to map errors across and up. `common`, shape (11,), has the values common to all channels.
     """
 
     rows: Floats
@@ -47,7 +47,7 @@ class System(NamedTuple):
 
 
 class _Fit(NamedTuple):
-    """Misfits summed by clock, shape (C,), and by axis, shape (3,), and the implied steps of position and clocks."""
+    """Misfits summed by clock, shape (C,), and by axis, shape (3,), and the resulting steps of position and clocks."""
 
     by_clock: Floats
     by_axis: Floats
@@ -56,7 +56,7 @@ class _Fit(NamedTuple):
 
 
 class RangeErrors(NamedTuple):
-    """Additional errors of single ranges: `bias` and variance `beyond`; `any` is True if there are such errors.
+    """Additional errors of individual ranges: `bias` and variance `beyond`; `any` is True if there are such errors.
 
     `gain` has the gains of the ranges before exclusions. `own` is work space for gains after exclusions.
     """
@@ -220,9 +220,9 @@ def write_with_map(model: Any, errors: Any, k: float, t: int, channels: Channels
 def write_without_map(
     model: Any, errors: Any, t: int, channels: Channels, fit: _Fit, with_map: System, system: System
 ) -> bool:
-    """Write the equations without the map, and return True if they determine a position.
+    """Write the equations without the map, and return True if these equations determine a position.
 
-    Offsets include the full distance between the positions without and with the map, and separations are not tested.
+    Separations are not tested. Offsets include the full distance between the positions with and without the map.
     """
     n, rows, common = len(channels.root), system.rows, system.common
     information, variance = errors.map_information[t], errors.scale[t] ** 2
@@ -246,7 +246,7 @@ def write_without_map(
 
 @inner
 def _without_map(covariance: Floats, prior: Floats, information: Floats, scale: float) -> tuple[Floats, bool]:
-    """Return the position covariance with `information` instead of the map's prior, and True if it exists."""
+    """Return the position covariance for `information` instead of the map prior, and True if the covariance exists."""
     normal, regular = _inverse(covariance)
     for a in range(3):
         for b in range(3):
@@ -265,7 +265,7 @@ def _without_map(covariance: Floats, prior: Floats, information: Floats, scale: 
 
 @inner
 def _inverse(matrix: Floats) -> tuple[Floats, bool]:
-    """Return the inverse of a symmetric 3 x 3 matrix, and True if the matrix scaled to a unit diagonal is regular."""
+    """Return the inverse of a symmetric 3 x 3 matrix, and True if, scaled to a unit diagonal, it is regular."""
     inverse, unit = np.empty((3, 3)), np.empty(3)
     for a in range(3):
         if not matrix[a, a] > 0.0:

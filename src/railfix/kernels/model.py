@@ -1,4 +1,4 @@
-"""Linearisation and whitening of ranges at a position with the clocks eliminated, and residuals of the ranges."""
+"""Linearised and whitened ranges at a position, after elimination of the clocks, and residuals of these ranges."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def linearise_ranges(
     place_ecef_m : ndarray, shape (T, 3) [m]
         Linearisation points; NaN without a position, for which design, misfit and covariance are NaN.
     axes : ndarray, shape (T, 3, 3)
-        Unit vectors of the unknowns.
+        Unit vectors along which the position unknowns are measured.
     prior : ndarray, shape (3, 3) [1/m^2]
         Prior information on the position.
 

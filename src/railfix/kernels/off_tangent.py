@@ -1,4 +1,4 @@
-"""Probability that the true position is on a part of the line away from the tangent at the estimated position."""
+"""Probability that the true position is on a part of the line that deviates from the tangent at the estimate."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from railfix.kernels.compiling import inner, kernel
 
 @inner
 def _inverse(matrix: Floats) -> Floats:
-    """Return the inverse of a symmetric 3 x 3 matrix, which is not finite if the matrix is singular."""
+    """Return the inverse of a symmetric 3 x 3 matrix; the inverse is not finite if the matrix is singular."""
     inverse = np.empty((3, 3))
     for a in range(3):
         i, j = (a + 1) % 3, (a + 2) % 3
@@ -30,7 +30,7 @@ def _inverse(matrix: Floats) -> Floats:
 
 @inner
 def _tail(clear_m: float, spread: float, start: float, misfit: float, tau: float) -> float:
-    """Return an upper bound of the tail for a matrix of at least ``1 - tau`` times the matrix of all channels."""
+    """Return an upper bound of the tail if the matrix is at least ``1 - tau`` times the matrix of all channels."""
     if not tau < 1.0:
         return 1.0
     form = (start + math.sqrt(max(tau, 0.0)) * misfit) ** 2 / (1.0 - tau)
@@ -41,7 +41,7 @@ def _tail(clear_m: float, spread: float, start: float, misfit: float, tau: float
 
 @inner
 def _lowest(form: Floats) -> tuple[float, float, float, float, float, float, float]:
-    """Return the minimum point of a quadratic form, and diagonal cofactors and inverse determinant of its matrix.
+    """Return a quadratic form's minimum point, and the diagonal cofactors and inverse determinant of its matrix.
 
     A form is an array of a constant, three elements of the slope, and the matrix elements xx, xy, xz, yy, yz, zz. All
     returned numbers are 0 if the matrix is singular.
@@ -75,7 +75,7 @@ def _compute_tail(form: Floats, clear_m: float) -> float:
 
 
 class _Residuals(NamedTuple):
-    """Projector of the used channels, their residuals, and the change of the residuals with the position (`rows`)."""
+    """Projector of the used channels, their residuals, and the gradients of the residuals (`rows`)."""
 
     projector: Floats  # (M, M)
     residual: Floats  # (M,)
@@ -94,7 +94,7 @@ def _work_space(channels: int) -> _Residuals:
 
 @inner
 def _without(i: int, j: int, residuals: Any, every: Floats, form: Floats) -> None:
-    """Write the quadratic form without channels i and j (-1 for none), from the form `every` of all channels."""
+    """Write the quadratic form without channels i and j (-1: no channel), from `every`, the form of all channels."""
     projector, residual, rows, _, _ = residuals
     for k in range(10):
         form[k] = every[k]
@@ -184,7 +184,7 @@ def _whiten(
 ) -> int:
     """Write the used channels, their residuals, and their quadratic form; return the number of these channels.
 
-    The map error is assumed equal in all horizontal directions, because the tangent differs between positions.
+    The map error is assumed equal in all horizontal directions, because the tangent turns along the line.
     """
     root_weight, clock, clock_covariance_m2, design, covariance_m2, map_prior, misfit = model
     projector, residual, rows, whitened, group = residuals
@@ -247,13 +247,13 @@ def risk_off_tangent(
     sigma_m: tuple[float, float],
     enough: float,
 ) -> Floats:
-    """Return an upper bound of the probability that the true position is off the tangent, beyond a distance.
+    """Return an upper bound of the probability that the true position is farther than `clear_m` away.
 
     At a horizontal distance D, a quadratic form exceeds its value at the position by at least ``(D - |c|)^2 / trace(C)
-    - c . s``. Here c is the minimum point and C the inverse of the matrix, both horizontal, and s is the slope. Without
-    the channels J, whose rows of the design are F_J, the matrix is at least ``1 - tau`` times the matrix of all
-    channels, with ``tau = trace(F_J C F_J^T S_JJ^-1)``. The largest tau of single channels and of pairs decides most
-    epochs. In other epochs, each subset is bounded separately.
+    - c . s``. Here c and C are the horizontal parts of the minimum point and of the inverse matrix, and s is the slope.
+    Without the channels J, whose rows of the design are F_J, the matrix is at least ``1 - tau`` times the matrix of all
+    channels, with ``tau = trace(F_J C F_J^T S_JJ^-1)``. In most epochs, the bound with the largest tau of all single
+    channels and pairs is sufficient. In other epochs, each subset is bounded separately.
 
     Parameters
     ----------
@@ -267,11 +267,11 @@ def risk_off_tangent(
     side_prior : float
         Prior fault probability of a whole side.
     clear_m : ndarray, shape (T,) [m]
-        Distance within which no part of the line deviates from the tangent.
+        Distance from the position within which the line does not deviate from the tangent.
     sigma_m : tuple of float [m]
         Map sigmas in plan and height.
     enough : float
-        Probability up to which a loose bound is sufficient.
+        A loose bound is sufficient if it is at most this probability.
 
     Returns
     -------
@@ -343,7 +343,7 @@ def risk_off_tangent(
 def forms_of_hypotheses(
     model: Any, scale: Floats, likely: Floats, sides: Masks, side_prior: float, sigma_m: tuple[float, float]
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Return the quadratic forms of K hypotheses: no fault, a fault of each channel, of each pair and of each side.
+    """Return the quadratic forms of K hypotheses: no fault, or a fault of one channel, of one pair or of one side.
 
     Parameters are those of `risk_off_tangent`.
 
@@ -354,7 +354,7 @@ def forms_of_hypotheses(
     form : ndarray, shape (T, K, 10)
         Quadratic forms, as in `_lowest`.
     lowest_m, depth, widest_m2 : ndarray, shape (T, K)
-        Distance to the minimum (NaN for a singular matrix), depth of the minimum, and trace of the inverse matrix.
+        Distance to the minimum (NaN for a singular matrix), decrease to it, and trace of the inverse matrix.
     """
     epochs, channels = model.root_weight.shape
     most = 0
@@ -370,7 +370,7 @@ def forms_of_hypotheses(
     residuals = _work_space(channels)
     for t in range(epochs):
         n = _whiten(model, t, scale[t], sigma_m, used, residuals, every)
-        prior[t, 0], at = 2.0, 1  # two-sided: noise of either sign
+        prior[t, 0], at = 2.0, 1  # 2, because noise has either sign
         _without(-1, -1, residuals, every, form[t, 0])
         for i in range(n):
             for j in range(-1, i):
@@ -408,13 +408,13 @@ def risk_beyond(
     prior, form : ndarray
         Results of `forms_of_hypotheses`: ``q(d) = constant - 2 d . slope + d^T matrix d`` at the displacement d.
     radius_m : ndarray, shape (T, K)
-        Largest distance of the line beyond the level at which each hypothesis is included.
+        A hypothesis is included if a section beyond the level is nearer to the position than this.
     first : ndarray of int, shape (T + 1,)
-        First section of each epoch, and P at the end.
+        Index of the first section of each epoch; the last entry is the number of sections P.
     start_m, tangent : ndarray, shape (P, 3)
     length_m : ndarray, shape (P,)
     beyond_m : ndarray, shape (P,)
-        Distance of each section beyond the level; infinite for other sections.
+        Distance of each section that is beyond the level; infinite for sections within the level.
     """
     epochs, hypotheses = prior.shape
     spent = np.zeros(epochs)

@@ -37,7 +37,7 @@ class _Equations(NamedTuple):
 def reduce_epoch(epoch: _Epoch, place_ecef_m: Floats, equations: _Equations) -> None:
     """Compute the normal equations of one epoch.
 
-    The vectorised loops have no branches, so that unused channels must have finite values, too.
+    The vectorised loops have no branches; unused channels must therefore have finite values, too.
     """
     sat_ecef_m, code_m, weight, starts, offset_m, _ = epoch
     system, means, rows, totals, _ = equations
@@ -115,7 +115,7 @@ def _tie(epoch: _Epoch, equations: _Equations) -> None:
 
 @kernel
 def reduced_equations(ranges: Any, place_ecef_m: Floats) -> tuple[Floats, Floats, Floats, Masks]:
-    """Compute the normal equations of position and residual with the clocks eliminated.
+    """Compute the normal equations of position and residual after elimination of the clocks.
 
     Parameters
     ----------
@@ -197,7 +197,7 @@ def misfits(ranges: Any, place_ecef_m: Floats, epochs: Indices) -> Floats:
 def _settle(step: Floats, means: Floats, rows: Floats, totals: Floats, clock_m: Floats, residual_m: Floats) -> None:
     """Compute the clocks and residuals of one epoch after a step of the position, to first order.
 
-    After a step of 5 m, the neglected gradient of the Earth's rotation correction causes an error of 0.03 mm.
+    For a step of 5 m, neglecting the gradient of the Earth rotation correction causes an error of 0.03 mm.
     """
     for g in range(len(totals)):
         moved = means[3, g] - (step[0] * means[0, g] + step[1] * means[1, g] + step[2] * means[2, g])
@@ -317,7 +317,7 @@ def _form(system: Floats, a: Floats, b: Floats) -> float:
 def _along(
     system: Floats, tangent: Floats, across: Floats, up: Floats, plan: float, height: float
 ) -> tuple[float, float, float, float]:
-    """Return step, sigma, sigma without map error, and minimum WSSE along a section.
+    """Return the step, its sigma with and without the map error, and the minimum WSSE along a section.
 
     The map error across the section is eliminated with the Schur complement.
     """

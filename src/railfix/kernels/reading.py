@@ -10,7 +10,7 @@ from railfix.core.arrays import Bytes, Floats, Indices, Integers, Masks
 from railfix.kernels.compiling import inner, kernel
 
 _U = np.uint64
-#: The same constants as in `railfix.io.rinex.observations_decode`.
+#: Copies of constants in `railfix.io.rinex.observations_decode`.
 _WIDTH, _TAIL_WRONG, _BLANK, _ZERO = 16, np.uint8(255), np.uint8(32), np.uint8(48)
 _BLANKS, _ZEROS, _ZEROS_POINT = _U(0x2020202020202020), _U(0x3030303030303030), _U(0x30303030302E3030)
 _NOT_A_DIGIT, _MINUS, _BYTE, _ONE, _NONE = _U(0x1010101010101010), _U(0x0D0D0D0D0D0D0D0D), _U(0xFF), _U(1), _U(0)
@@ -45,7 +45,7 @@ def decode_fields(
     """Decode the fields of n lines that have the standard form; the arguments are those of `read_fields`.
 
     All results have shape (n, k). Return the values, which are NaN for blank fields and fields of another form. Also
-    return the loss-of-lock digits (255 if the last two characters are wrong), and True for fields of another form.
+    return the loss-of-lock digits (255 if the last two characters are invalid), and a mask of fields of another form.
     """
     rows, columns = len(start), len(index)
     value, lock = np.empty((rows, columns)), np.zeros((rows, columns), dtype=np.uint8)
@@ -103,7 +103,7 @@ def place_fields(
     kinds, lock : ndarray, shape (4, T, M), and of uint8, (T, M)
         Values per kind of observable, and loss-of-lock digits.
     cell : ndarray of int, shape (n,)
-        Index of the epoch times M plus the satellite's first channel, for each line.
+        For each line, M times the index of the epoch plus the index of the satellite's first channel.
     kind, signal : ndarray of int, shape (k,)
         Kind of observable of each field, and index of its channel within the satellite.
     value, digit : ndarray, shape (n, k)

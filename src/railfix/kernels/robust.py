@@ -11,7 +11,7 @@ from railfix.core.arrays import Floats, Indices, Masks
 from railfix.kernels.compiling import inner, kernel
 from railfix.kernels.sight import sight
 
-#: Smallest scale of whitened residuals; a smaller scale is a coincidence.
+#: Lower limit of the scale of whitened residuals; smaller scales occur only by coincidence.
 _LEAST_SCALE = 0.05
 
 
@@ -20,9 +20,9 @@ class _Room(NamedTuple):
 
     Fields of shape (M,) are the index `channel` in the ranges, the `base` weight and its `root`, the `misfit`, the
     robust `factor`, the `weight`, the whitened residual `white`, and the `order` of these residuals. `sight`, shape (3,
-    M), are unit vectors to the satellites. `row`, shape (4, M), are sights and misfits minus the mean of the clock.
-    `total`, shape (G,), and `mean`, shape (4, G), are weights and mean rows of the clocks. `mass`, shape (G,), and
-    `apart`, shape (4, G), are weights and differences of clocks with known offsets.
+    M), are unit vectors to the satellites. `row`, shape (4, M), are sights and misfits minus their mean over the clock.
+    `total`, shape (G,), and `mean`, shape (4, G), are weights and mean rows of the clocks. With known clock offsets,
+    `mass`, shape (G,), are the weights of the clocks, and `apart`, shape (4, G), their mean rows minus the common mean.
     """
 
     begin: Indices
@@ -61,7 +61,7 @@ def reweight_ranges(
         Linearisation points, in C order.
     information : ndarray, shape (T, 3, 3) [1/m^2], or (0, 3, 3)
     correction : ndarray, shape (T,)
-        Ratio of scale to median of the residuals.
+        Ratio of the scale to the median of the absolute residuals.
     keep, reject : float
     iterations : int
 
@@ -114,7 +114,7 @@ def _new_room(channels: int, clocks: int) -> _Room:
 
 @inner
 def _choose_channels(ranges: Any, t: int, place: Floats, room: _Room) -> int:
-    """Write the used channels contiguously, with sights and misfits; return the number of these channels."""
+    """Write the used channels, their sights and misfits to contiguous arrays; return the number of used channels."""
     channels, clocks, count = ranges.weight.shape[1], len(ranges.starts), 0
     for g in range(clocks):
         room.begin[g], stop = count, ranges.starts[g + 1] if g + 1 < clocks else channels
@@ -135,7 +135,7 @@ def _choose_channels(ranges: Any, t: int, place: Floats, room: _Room) -> int:
 
 @inner
 def _sum_clocks(room: _Room) -> None:
-    """Write the weights, and each clock's total weight and mean row, and subtract the mean row from the rows."""
+    """Write the weights and each clock's total weight and mean row; subtract the mean rows from the rows."""
     for g in range(len(room.total)):
         total = x = y = z = misfit = 0.0
         for k in range(room.begin[g], room.begin[g + 1]):
@@ -198,7 +198,7 @@ def _add_ties(offset_m: Floats, sigma_m: Floats, room: _Room, normal: Floats, ve
 
 @inner
 def _solve(normal: Floats, vector: Floats, step: Floats) -> bool:
-    """Solve three symmetric equations, and return True if they are regular; otherwise, the step is zero."""
+    """Solve three symmetric equations; return True if their matrix is regular, otherwise set the step to zero."""
     a, b, c, d, e, f = normal[0, 0], normal[0, 1], normal[0, 2], normal[1, 1], normal[1, 2], normal[2, 2]
     of_x, of_y, of_z = d * f - e * e, c * e - b * f, b * e - c * d
     determinant, mean = a * of_x + b * of_y + c * of_z, (a + d + f) / 3.0
@@ -226,7 +226,7 @@ def _write_residuals(step: Floats, solved: bool, room: _Room) -> None:
 
 @inner
 def _median(count: int, room: _Room) -> float:
-    """Return the median of the whitened residuals; `room.order` is kept, because it changes little between calls."""
+    """Return the median of the whitened residuals; `room.order` is reused in the next call, where it changes little."""
     for k in range(count):
         at, number = k, room.order[k]
         while at > 0 and room.white[room.order[at - 1]] > room.white[number]:

@@ -9,7 +9,7 @@ import numpy as np
 from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.kernels.compiling import inner, kernel
 
-#: Integer of NaT, the time of an event that has not occurred.
+#: Integer value of NaT, which stands for the time of an event that has not occurred.
 NEVER = np.iinfo(np.int64).min
 _NS = 1_000_000_000
 
@@ -40,8 +40,8 @@ def suspicions(
 
     An offset is the sum of the metric since the jump, so that chunk boundaries have no effect. `metric` and `limit`
     have shape (T, M), in C order. `level_before` and `since_before`, shape (M,), are offsets and starts of suspicions
-    before the chunk; the start is `NEVER` without a suspicion. Return True for rejected codes, and the offsets, which
-    are 0 without a suspicion and NaN without a metric. Also return the starts of suspicions that continue.
+    before the chunk; the start is `NEVER` without a suspicion. Return a mask of rejected codes; offsets, 0 where there
+    is no suspicion and NaN where the metric is NaN; and the starts of suspicions at the end of the chunk.
     """
     epochs, channels = metric.shape
     reject, level = np.zeros((epochs, channels), dtype=np.bool_), np.empty((epochs, channels))
@@ -67,9 +67,9 @@ def suspicions(
 
 @kernel
 def clock_medians(values: Floats, clock: Indices, satellite: Indices, least: int) -> Floats:
-    """Return the median of the values of all channels with the same clock for each channel, shape (T, M).
+    """For each channel, return the median of the values of all channels with the same clock, shape (T, M).
 
-    NaN values are ignored. A median is NaN with finite values of fewer than `least` satellites. `clock` and `satellite`
+    NaN values are ignored. A median is NaN if fewer than `least` satellites have finite values. `clock` and `satellite`
     are the indices of each channel's clock and satellite, shape (M,).
     """
     epochs, channels = values.shape
@@ -118,7 +118,7 @@ def falls_of_cn0(
     known_after_s: float,
     least: int,
 ) -> tuple[Floats, Floats, Floats, tuple[Floats, Floats, Floats]]:
-    """Return the statistics of `PowerSigns` on falls of C/N0 below recent peaks, shape (T,), and the next `before`.
+    """Return statistics of falls of C/N0 below recent peaks (`PowerSigns`), shape (T,), and `before` of the next chunk.
 
     `before` are peaks, start times and last observation times of `PowerState`, shape (K,). `decay` is in dB/s.
     """
@@ -162,7 +162,7 @@ def clock_steps(
     """Return the median over channels of code change minus Doppler change, shape (T,), and the next `before`.
 
     `before` has the last code, Doppler and time of each channel, shape (K,). Values are not compared across a break or
-    after more than `longest_s`. The median is NaN with fewer than `least` channels.
+    after more than `longest_s`. The median is NaN if there are fewer than `least` channels.
     """
     epochs, channels = code_m.shape
     code, rate, since = before[0].copy(), before[1].copy(), before[2].copy()
@@ -196,7 +196,7 @@ def holds(
     hold_ns: Integers,
     release_s: Floats,
 ) -> tuple[Masks, Masks, tuple[Integers, Integers]]:
-    """Return two masks, shape (T, C): conditions that have been true for the required time, and active conditions.
+    """Return two masks, shape (T, C), of conditions that have been true for `hold_ns`, and of active conditions.
 
     A condition remains active for `release_s` (`integrity.interference.limits.hold_signs`). `before` has the duration
     of each condition and the last time at which it counted as true, shape (C,). Also return the next `before`.

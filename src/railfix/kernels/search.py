@@ -1,4 +1,4 @@
-"""Search for line points near a position and for the best of them, and distances within which a line is straight."""
+"""Search for the line points near a position and the best of these points; distance within which a line is straight."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from railfix.core.arrays import Floats, Indices, Integers, Masks
 from railfix.core.constants import ALONG, CLEAR_M, FAN_OUT, ON_TANGENT_M, ROTATION_GRADIENT
 from railfix.kernels.compiling import inner, kernel
 
-#: Half the inverse of the shortest satellite range [m], of GLONASS at the zenith, rounded down [1/m].
+#: Half the inverse [1/m] of the shortest satellite range: GLONASS at the zenith, rounded down to 1.9e7 m.
 _CURVATURE = 1.0 / (2.0 * 1.9e7)
 #: Allowance for rounding errors in the radius of a stretch of line [m].
 _SLACK_M = 1e-6
@@ -19,7 +19,7 @@ _SLACK_M = 1e-6
 
 @inner
 def _bend_m(distance_m: float) -> float:
-    """Return the largest linearisation error of a range [m] at a distance from the linearisation point [m]."""
+    """Return the largest error [m] of a linearised range at a given distance [m] from the linearisation point."""
     return distance_m * distance_m * _CURVATURE + ROTATION_GRADIENT * distance_m
 
 
@@ -41,11 +41,11 @@ def radii_of_balls(
     Parameters
     ----------
     distance_m, away_m : ndarray, shapes (n,), (n, 3) [m]
-        Distance and vector from the 3-D position to the nearest point of the line.
+        Distance from the 3-D position to the nearest point of the line, and vector to this point.
     matrix, covariance_m2, wsse : ndarray, shapes (n, 3, 3), (n, 3, 3), (n,)
         Normal matrix, covariance and WSSE of the 3-D positions.
     weight_norm : ndarray, shape (n,)
-        Root of the summed weights.
+        Square root of the summed weights.
     freedom : ndarray of int, shape (n,)
         Redundancy of a position on the line, at least 1.
     limit : float
@@ -127,7 +127,7 @@ def points_in_balls(
     matrix, least : ndarray, shapes (n, 3, 3), (n,)
         Coefficients of the quadratic form about the centre: normal matrix, and q at the centre.
     weight_norm : ndarray, shape (n,)
-        Root of the summed weights.
+        Square root of the summed weights.
 
     Returns
     -------
@@ -176,7 +176,7 @@ def points_in_balls(
 
 @inner
 def _floor(vertex: int, q: float, slope: Floats, matrix: Floats, tangent: Floats, length_m: Floats) -> float:
-    """Return the minimum of q by the quadratic form on the two sections that meet at a point."""
+    """Return the minimum of the quadratic form of q on the two sections that meet at a point."""
     floor = q
     for side in range(2):
         section, sign = vertex - side, 1.0 - 2.0 * side
@@ -200,7 +200,7 @@ def best_points(
     separation_m: float,
     turn_m: float,
 ) -> tuple[Indices, Floats, Floats, Indices]:
-    """Select each epoch's best point, and its best point that counts as another position.
+    """For each epoch, select the best point, and the best of the points that do not count as the same position.
 
     Parameters
     ----------
@@ -209,7 +209,7 @@ def best_points(
     line : tuple of ndarray
         `arc_m`, `tangent` and `length_m` of the trajectory.
     separation_m : float
-        Largest distance along the line of points that count as one position.
+        Points up to this distance apart along the line count as one position.
     turn_m : float
         Length of a closed line; infinite for an open line.
 
@@ -258,7 +258,7 @@ def clear_of_sections(
     stretches: tuple[Indices, Floats, Indices],
     section: Indices,
 ) -> Floats:
-    """Return the horizontal distance [m] from each of S sections within which the line follows the section's tangent.
+    """For each of S sections, return the horizontal distance [m] within which the line follows the section's tangent.
 
     `ecef_m`, shape (P, 3), has the points of the line, `tangent`, `across` and `length_m` have its sections. `section`
     are the indices of the S sections. `stretches` is a field of `SearchIndex`.

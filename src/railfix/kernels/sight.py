@@ -1,4 +1,4 @@
-"""Distance and direction to a satellite with the Earth's rotation (`railfix.core.geodesy.range_with_rotation`)."""
+"""Distance and direction to a satellite, with Earth rotation (`railfix.core.geodesy.range_with_rotation`)."""
 
 from __future__ import annotations
 

@@ -20,11 +20,11 @@ _NS: Final = 1_000_000_000
 def window_ages(
     time_ns: Integers, last_ns: Integers, last_age: Floats, ends: Indices, window_s: float, least_epochs: float
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return the ages of T epochs of A antennas, in windows of `window_s`.
+    """Return the ages (elapsed times in units of `window_s`) of T epochs of A antennas.
 
-    The rows of an antenna end before its entry in `ends`. `last_ns`, shape (A,), is the time of each antenna's previous
+    `ends` has the index after each antenna's last row. `last_ns`, shape (A,), is the time of each antenna's previous
     epoch, or NaT. Return three arrays of shape (T,): time since the previous epoch [s], age within the current span of
-    `SPAN` windows, and number of spans begun since the previous epoch. Also return the last ages, shape (A,).
+    `SPAN` windows, and number of spans begun since the previous epoch. Also return each antenna's last age, shape (A,).
     """
     epochs = len(time_ns)
     step, in_span, begun, end_age = np.zeros(epochs), np.empty(epochs), np.empty(epochs), last_age.copy()
@@ -48,7 +48,7 @@ def decayed_sums(values: Floats, growth: Floats, decay: Floats, current: Floats,
     """Return for each epoch the sum of the values of earlier epochs with the weights ``exp(-difference of ages)``.
 
     `values`, shape (T, K), are already multiplied by `growth`. The running sums `current`, shape (A, K), are updated in
-    place. They are multiplied by the growth since the start of a span, so that chunks have no effect on results.
+    place. Values and sums refer to the start of a span, so that the division into chunks has no effect on results.
     """
     before, first = np.empty(values.shape), 0
     for a in range(len(ends)):

@@ -21,7 +21,7 @@ from railfix.kernels.tracking.update import Equations, Fit, mean_weights
 
 @inner
 def mean_square(rows: Rows, own: slice, found: Fit) -> float:
-    """Return the weighted mean square of the normalised residuals of the rows `own`; NaN for less than four."""
+    """Return the weighted mean square of the normalised residuals of the rows `own`; NaN for fewer than four rows."""
     size, total = own.stop - own.start, 0.0
     for j in range(own.start, own.stop):
         total += found.weight[j] * (found.residual[j] ** 2 + found.fitted[j]) / rows.variance[j]
@@ -38,7 +38,7 @@ def update_scale(log_scale: float, mean_square: float, dt: float) -> float:
 
 @inner
 def update_doubt(monitors: Record, rows: Rows, found: Fit, dt: float) -> None:
-    """Update the timers of low motion and code weights, and the low-pass filtered misfit of Dopplers and phases."""
+    """Update the timers of low weights of motion and of codes, and the filtered mean misfit of Dopplers and phases."""
     code, motion = mean_weights(rows, rows.variance, found.weight)
     if motion < constants.LOST_MOTION_WEIGHT:
         monitors.weak_motion_s += dt
@@ -57,7 +57,7 @@ def update_doubt(monitors: Record, rows: Rows, found: Fit, dt: float) -> None:
 
 @inner
 def adapt(given: Given, t: int, state: State, rows: Rows, found: Fit, innovation: Floats, shift: float) -> bool:
-    """Adapt the state to an epoch's fit; return True if another satellite's codes are excluded from the next epoch on.
+    """Adapt the state to an epoch's fit; return True if codes of a further satellite are excluded after this epoch.
 
     `shift` is the result of `compute_code_shift` for the reported hypothesis.
     """
@@ -91,7 +91,7 @@ def update_bias(code_bias: float, innovation: float, code_s: float) -> float:
 
 @inner
 def is_faulty(code_bias: float) -> bool:
-    """Return True for a mean innovation that is so large that the satellite's codes are excluded."""
+    """Return True if a satellite's mean innovation is so large that its codes are excluded."""
     return bool(code_bias > constants.BIAS_FAULTY or code_bias < constants.BIAS_SHORT)
 
 
@@ -101,7 +101,7 @@ def compute_code_shift(rows: Rows, equations: Equations, covariance: Floats, wei
 
     The shift is the score of the innovations v, ``h' S^-1 v / sqrt(h' S^-1 h)``, where h are the coefficients of the
     arc length. It is standard normal and white over epochs if the model is correct. `covariance`, shape (Q, Q), is H P
-    H' of the quantities before the measurements, codes first. `weight`, shape (M,), has the initial weights; larger
+    H' of the quantities before the correction, codes first. `weight`, shape (M,), has the initial weights; larger
     weights than 1 count as 1.
     """
     codes = rows.code.stop
@@ -124,7 +124,7 @@ def compute_code_shift(rows: Rows, equations: Equations, covariance: Floats, wei
 
 @inner
 def update_map_scale(monitors: Record, shift: float, dt: float, parameters: Record) -> None:
-    """Update the mean code shift with an epoch's shift, and adapt the assumed length error of the map."""
+    """Update the mean code shift with the `shift` of an epoch, and adapt the assumed length error of the map."""
     dt = min(dt, 1.0)
     share = 1.0 - math.exp(-dt / constants.MAP_MISFIT_S)
     if abs(shift) > constants.STEP_SIGMAS:

@@ -1,8 +1,8 @@
-"""Measurement equations of one epoch, linearised at one Gaussian.
+"""Measurement equations of one epoch for one Gaussian, linearised at its mean.
 
-docs/filter-equations.md has the equations of the rows of H and A. For the change of a carrier phase, the direction of
-the chord is used at both ends. With the tangent at each end, the phases would determine the absolute position from the
-bends of the line, more accurately than the line is known.
+docs/filter-equations.md has the equations of the rows of H and A. The equation of a carrier-phase change uses the
+direction of the chord at both ends of the interval. With the tangent at each end, the phases would determine the
+absolute position from the bends of the line, more accurately than the line is known.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ class Geometry(NamedTuple):
     point: Floats  #: Position at this epoch, ECEF [m]; shape (3,).
     axes: Floats  #: Tangent, right and up at this epoch's position; shape (3, 3).
     before: Floats  #: Position at the previous epoch, ECEF [m]; shape (3,).
-    #: Unit vector of the displacement since the previous epoch, or the tangent if nearly at rest; shape (3,).
+    #: Unit vector of the displacement since the previous epoch, or the tangent if it is below `CHORD_M`; shape (3,).
     chord: Floats
     distance: Floats  #: Range of each channel with measurements [m]; shape (K,).
     sight: Floats  #: Unit vectors to the satellites, ECEF; shape (K, 3).
     along: Floats  #: Components of `sight` along `axes`; shape (K, 3).
 
 
-#: Unknowns s, s' and d_t of the distance travelled since the previous epoch, which is s - s' + d_t.
+#: Unknowns s, s' and d_t. The distance travelled since the previous epoch is s - s' + d_t.
 DISTANCE = (ix.ARC, ix.PREVIOUS_ARC, ix.MAP_LENGTH_ERROR)
-#: Pairs of a motion quantity and the single unknown of which it consists.
+#: Pairs of a motion quantity and the single unknown that it equals.
 OWN_UNKNOWNS = (
     (ix.M_CLOCK, ix.PHASE_CLOCK), (ix.M_RIGHT, ix.STEP_RIGHT), (ix.M_UP, ix.STEP_UP), (ix.M_DRIFT, ix.DRIFT),
 )  # fmt: skip
@@ -63,8 +63,8 @@ def linearise(
 ) -> None:
     """Write an epoch's equations, linearised at the arc lengths `at` [m] of this epoch and of the previous epoch.
 
-    The innovations refer to the mean x: the difference between x and `at` is added to first order. `wheel_sign` is the
-    result of `find_wheel_sign`.
+    The innovations are computed at the mean x; for the difference between x and `at`, they are linear. `wheel_sign` is
+    the result of `find_wheel_sign`.
     """
     geometry = _compute_geometry(given, t, at)
     _write_codes(given, t, rows, x, geometry, x[ix.ARC] - at[0], equations)
@@ -105,7 +105,7 @@ def _compute_geometry(given: Given, t: int, at: tuple[float, float]) -> Geometry
 def _write_motion_quantities(first: int, x: Floats, at: tuple[float, float], equations: Equations) -> Floats:
     """Write the six motion quantities, from index `first` on; return their values at the mean, shape (6,).
 
-    The value of the distance is relative to the distance between the points at the arc lengths `at`. It includes the
+    The returned distance is the distance travelled minus the difference of the two arc lengths `at`. It includes the
     map's length error, because phases measure the distance travelled, not the distance on the map.
     """
     unknown, coefficient, motion = equations.unknown, equations.coefficient, np.empty(ix.MOTION)
@@ -122,7 +122,7 @@ def _write_motion_quantities(first: int, x: Floats, at: tuple[float, float], equ
 def _write_codes(
     given: Given, t: int, rows: Rows, x: Floats, geometry: Geometry, moved: float, equations: Equations
 ) -> None:
-    """Write the codes, each as a row and a quantity with the same index, for a mean `moved` [m] ahead of `geometry`."""
+    """Write each code as row and quantity of one index; the mean is `moved` [m] ahead of the point in `geometry`."""
     unknown, coefficient = equations.unknown, equations.coefficient
     for j in range(rows.code.start, rows.code.stop):
         k = rows.channel[j]
@@ -144,7 +144,7 @@ def _write_codes(
 
 @inner
 def _write_motion_value(value: float, j: int, motion: Floats, equations: Equations) -> None:
-    """Write the innovation of a phase or Doppler for the values `motion` of the motion quantities."""
+    """Write the innovation of a phase or Doppler from the values `motion` of the motion quantities."""
     for a in range(ix.MOTION):
         value -= equations.design[j, a] * motion[a]
     equations.value[j] = value

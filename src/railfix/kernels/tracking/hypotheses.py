@@ -16,14 +16,14 @@ from railfix.kernels.tracking.line import write_point
 
 @inner
 def log_sum(values: Floats) -> float:
-    """Return the logarithm of the sum of exponentials."""
+    """Return the logarithm of the sum of the exponentials of the values."""
     largest = values.max()
     return float(largest + math.log(np.exp(values - largest).sum()))
 
 
 @inner
 def clip_odds(odds: float, gained: float, reach: float) -> float:
-    """Return log odds after a gain, limited to +-`reach`, or to the previous odds if these were larger in magnitude."""
+    """Return `odds + gained`, limited to +-`reach`; if `odds` is already beyond a limit, it replaces this limit."""
     return min(max(odds + gained, min(odds, -reach)), max(odds, reach))
 
 
@@ -31,12 +31,12 @@ def clip_odds(odds: float, gained: float, reach: float) -> float:
 def reweigh(
     parameters: Record, state: State, evidence: Floats, code_evidence: Floats, points: Floats, arc: Floats, dt: float
 ) -> None:
-    """Update the log probabilities, and the parts of them due to codes, with the evidence of motion and codes.
+    """With the evidence of motion and codes, update the log probabilities, and separately their parts due to codes.
 
     docs/filter-equations.md has the bounds of the evidence. They are required because errors are correlated over
-    epochs: map errors always, motion errors for seconds, and code errors of all satellites on one side of a street for
-    minutes. The evidence of motion is therefore multiplied by the interval, at most 1 s. For laps within `ALIKE` times
-    `map_branch_m`, recent evidence of codes is stored as `log_recent`, which only `find_leading` uses.
+    epochs: map errors permanently, motion errors for seconds, and code errors of all satellites on one side of a street
+    for minutes. The evidence of motion is therefore multiplied by the interval, at most 1 s. For laps within `ALIKE`
+    times `map_branch_m`, recent evidence of codes is stored as `log_recent`, which only `find_leading` uses.
 
     `evidence` is the log evidence of motion, and `code_evidence` the log evidence of codes given the motion, shape
     (H,). `points`, shape (H, 3), and `arc`, shape (H,), are the positions [m].
@@ -74,7 +74,7 @@ def reweigh(
 
 @inner
 def find_leading(hypothesis: Records, count: int) -> int:
-    """Return the hypothesis to report: the first, or another if recent codes make it `SWITCH` times as probable."""
+    """Return the hypothesis to report: the first, unless recent codes make another `SWITCH` times as probable."""
     lead = hypothesis["log_probability"][:count] + hypothesis["log_recent"][:count]
     best = int(np.argmax(lead))
     return best if lead[best] - lead[0] > math.log(constants.SWITCH) else 0
@@ -82,7 +82,7 @@ def find_leading(hypothesis: Records, count: int) -> int:
 
 @inner
 def prune(given: Given, state: State) -> Indices:
-    """Sort the hypotheses, merge duplicates, drop improbable hypotheses, and return the previous indices of the others.
+    """Sort the hypotheses, merge duplicates, drop improbable hypotheses, and return the previous indices of the rest.
 
     Improbable hypotheses are dropped only after the first one has travelled `DECIDED_TRAVEL_M`.
     """
@@ -107,9 +107,9 @@ def prune(given: Given, state: State) -> Indices:
 def _merge_twins(given: Given, state: State, ranked: Indices) -> tuple[Indices, Floats]:
     """Return hypotheses and log probabilities after merging hypotheses with the same position.
 
-    A hypothesis is merged within the sum of both standard deviations, but only within the smaller of them if a
-    hypothesis on another lap has the same position within the map error. Otherwise a right position could be merged
-    into a wrong position of the same lap, and the next bend would contradict this lap only.
+    Two hypotheses are merged if their distance is less than the sum of their standard deviations. If another lap has a
+    hypothesis at the same position within the map error, the smaller standard deviation is the limit. Otherwise a right
+    position could be merged into a wrong position of the same lap, and the next bend would contradict this lap only.
     """
     kept, log_probability, size = np.empty_like(ranked), np.empty(len(ranked)), 0
     arc, points, axes = state.x[: len(ranked), ix.ARC], np.empty((len(ranked), 3)), np.empty((3, 3))

@@ -16,7 +16,7 @@ PHASE_CLOCK, DRIFT = 4, 5
 MAP_RIGHT, MAP_UP = 6, 7
 #: Code clock at this epoch [m].
 CODE_CLOCK: Final = 8
-#: Error of the map's displacement since the previous epoch: right, up, along [m].
+#: Error of the displacement since the previous epoch according to the map: right, up, along [m].
 STEP_RIGHT, STEP_UP, MAP_LENGTH_ERROR = 9, 10, 11
 #: Wheel scale-factor error (no unit), positive if the wheel distance is too short.
 WHEEL: Final = 12
@@ -26,32 +26,32 @@ FORCE_OFFSET: Final = 13
 RADAR: Final = 14
 #: Time-correlated error of the Doppler speed [m/s].
 DOPPLER_SPEED: Final = 15
-#: Displacement along the line by code errors that last for hours (orbits, ionosphere) [m].
+#: Displacement of the position along the line by code errors that last for hours (orbits, ionosphere) [m].
 SLOW_CODE: Final = 16
 #: Speed at the previous epoch [m/s].
 PREVIOUS_SPEED: Final = 17
 #: System letters of the code clocks, in the order of the clock offsets in the state.
 CLOCKS: Final = ("G", "E", "C", "R", "I")
 CLOCK_COUNT: Final = len(CLOCKS)
-#: Index of the first clock offset [m], and of the first satellite code error, in units of its standard deviation.
+#: Indices of the first clock offset [m] and of the first satellite code error (unit: its standard deviation).
 OFFSETS: Final = 18
 SATELLITES: Final = OFFSETS + CLOCK_COUNT
 #: Unknowns that restart at every epoch: code clock and errors of the map's displacement.
 PER_EPOCH: Final = (CODE_CLOCK, STEP_RIGHT, STEP_UP, MAP_LENGTH_ERROR)
 
-#: Motion quantities of phases and Dopplers: distance, change of the phase clock, error of the map's displacement to the
-#: right and up, speed, drift.
+#: Motion quantities of phases and Dopplers: distance, change of the phase clock, right and up components of the error
+#: of the map's displacement, speed, drift.
 M_DISTANCE, M_CLOCK, M_RIGHT, M_UP, M_SPEED, M_DRIFT = 0, 1, 2, 3, 4, 5
 MOTION: Final = 6
-#: Largest number of unknowns in a quantity; the last term is the clock.
+#: Largest number of unknowns in a quantity, and index of the code clock among them.
 TERMS: Final = 7
 CLOCK_TERM: Final = TERMS - 1
 
 #: Kinds of GNSS measurements of a channel.
 CODE, PHASE, DOPPLER = 0, 1, 2
-#: Columns of sensors: wheel, radar, force, position, two for alternating balises, and one per range to a ground unit.
+#: Columns of sensors: wheel, radar, force, position, balises (two in turn), then one per ranging ground unit.
 WHEEL_COLUMN, RADAR_COLUMN, FORCE_COLUMN, PLACE_COLUMN, RANGE_COLUMN = 0, 1, 2, 3, 6
-#: Number of sensor kinds: one per column, with a single kind for all ranges.
+#: Number of sensor kinds: one for each column before the ranges, and one for all ranges.
 SENSORS: Final = 7
 #: Sub-filters that follow the sub-filters of sensors, by excluded source: all Dopplers, all phases, codes of satellites
 #: ahead, codes of satellites behind, the map, no source (all satellites in view).
@@ -60,8 +60,8 @@ ALL_DOPPLERS, ALL_PHASES, CODES_AHEAD, CODES_BEHIND, WRONG_MAP, ALL_IN_VIEW = 0,
 #: Reasons for a position search before an epoch, as bits: the track is lost, measurements were missing for `GAP_S`, or
 #: motion contradicts the position.
 LOST_TRACK, GAP, CONTRADICTED = 1, 2, 4
-#: State before the first epoch of a call: not predicted; predicted, with the position search completed; predicted and
-#: completed after a loss of track.
+#: State of a call's first epoch: not predicted; predicted, and position search completed; predicted, and position
+#: search completed after a loss of track.
 NOT_SOUGHT, SOUGHT, SOUGHT_AS_LOST = 0, 1, 2
 
 
@@ -70,7 +70,7 @@ class TrackStatus(IntEnum):
 
     #: One position, from measurements of this epoch.
     TRACKING = 0
-    #: Other positions on the line are more probable than the risk. One of the most probable positions is reported.
+    #: The probability of other positions on the line exceeds the risk. One of the most probable positions is reported.
     SEVERAL_BRANCHES = 1
     #: Predicted position: the epoch has no accepted measurement.
     COASTING = 2
@@ -85,10 +85,10 @@ class TrackStatus(IntEnum):
     #: One position, but 3-D positions of the last minutes are beside or above the line, or other tracks of the network
     #: are more probable than `track_risk`.
     MAP_OFFSET = 7
-    #: One position, but in the last 20 s the distance between both antennas was wrong by more than 5 m, or their speeds
-    #: differed by more than 1.5 m/s, and by more than four standard deviations in either case.
+    #: One position, but in the last 20 s the distance between both antennas was wrong by more than 5 m and four sigmas,
+    #: or their speeds differed by more than 1.5 m/s and four sigmas.
     ANTENNAS_DISAGREE = 8
-    #: One position, but measurements, the velocity or a sub-filter contradict the position: the error is not bounded.
+    #: One position, but measurements, the velocity or a sub-filter contradict it: the error is not bounded.
     DOUBTFUL = 9
     #: One position, but the signals may be spoofed: the error is not bounded.
     SPOOFING_SUSPECTED = 10

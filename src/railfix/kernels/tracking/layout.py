@@ -27,37 +27,37 @@ def record_of(fields: dict[str, Any]) -> np.dtype[Any]:
 EPOCH: Final = record_of({
     "time_s": float,  # time since `TrackState.origin` [s]
     "interval_s": float,  # time since the previous epoch [s]
-    "begins": bool,  # the state restarts before this epoch
-    "coded": bool,  # the epoch has codes
-    # error of the ionospheric model divided by the error in a quiet ionosphere; 0 without ionospheric error
+    "begins": bool,  # True if the state restarts before this epoch
+    "coded": bool,  # True if the epoch has codes
+    # ratio of the error of the ionospheric model to the error in a quiet ionosphere; 0 if there is no such error
     "tilt_scale": float,
-    "motion_measured": bool,  # enough phases or Dopplers (four) to propagate the position
-    "velocity_mps": (float, (3,)),  # ECEF velocity without the line, from phases or Dopplers [m/s]; NaN if unknown
+    "motion_measured": bool,  # True if at least four phases or Dopplers propagate the position
+    "velocity_mps": (float, (3,)),  # ECEF velocity from phases or Dopplers alone [m/s]; NaN if unknown
     "velocity_covariance": (float, (3, 3)),  # [m2/s2]
     "velocity_age_s": float,  # age of the velocity at the epoch [s]
-    "step": (float, (3, 3)),  # transition of arc length, speed and acceleration (R. A. Singer, 1970)
-    "noise": (float, (3, 3)),  # process noise of arc length [m], speed [m/s] and acceleration [m/s2]
+    "step": (float, (3, 3)),  # transition matrix of arc length, speed, acceleration (R. A. Singer, 1970)
+    "noise": (float, (3, 3)),  # process noise covariance of arc length [m], speed [m/s], acceleration [m/s2]
 })  # fmt: skip
 #: Measurements of one channel, which belongs to one satellite, at one epoch.
 CHANNEL: Final = record_of({
-    "satellite": np.intp,  # index of the satellite, its code error and its sub-filter; -1 without measurements
-    "clock": np.intp,  # index of the satellite's code clock in `CLOCKS`
+    "satellite": np.intp,  # index of the satellite, its code error and its sub-filter; -1 if it is not measured
+    "clock": np.intp,  # index in `CLOCKS` of the satellite's code clock
     "sat_ecef_m": (float, (3,)),  # satellite position at transmission [m]
     "sat_velocity_mps": (float, (3,)),  # [m/s]
     "before_ecef_m": (float, (3,)),  # satellite position at the previous epoch [m]
     "measured": (float, (3,)),  # corrected code [m], phase change since the previous epoch [m], range rate [m/s]
     "has": (np.int8, (3,)),  # 1 where `measured` is usable
-    "variance": (float, (3,)),  # white variances before adaptation, of codes over one second [m2, m2, m2/s2]
-    "code_sigma_m": float,  # standard deviation of the correlated code error [m], the unit of this unknown
+    "variance": (float, (3,)),  # white variances before adaptation [m2, m2, m2/s2], for codes averaged over 1 s
+    "code_sigma_m": float,  # standard deviation of the correlated code error [m]; this error's unknown has this unit
 })  # fmt: skip
 #: One sensor at one epoch.
 SENSOR: Final = record_of({
     "value": float,  # distance [m], force [m/s2], position [m] or range [m]; NaN without a measurement
     "sigma": float,  # standard deviation of `value`, in the same unit
     "age_s": float,  # age of positions, balises and ranges at the epoch [s]
-    "unsigned": bool,  # True for a distance without a sign, which is given the sign of the speed
+    "unsigned": bool,  # True for an unsigned distance, which gets the sign of the speed
     "unit_ecef_m": (float, (3,)),  # ECEF position of a range's ground unit [m]
-    "lever_m": (float, (3,)),  # lever arm from the trajectory to the vehicle's unit: along, right, up [m]
+    "lever_m": (float, (3,)),  # lever arm from the trajectory to the vehicle's ranging unit: along, right, up [m]
 })  # fmt: skip
 #: One vertex of the line, and the segment after it.
 VERTEX: Final = record_of({
@@ -70,12 +70,12 @@ VERTEX: Final = record_of({
 })  # fmt: skip
 #: The line as a whole.
 LINE: Final = record_of({
-    "sigma_plan_m": float,  # standard deviation of the map across the line [m]
-    "sigma_height_m": float,  # standard deviation of the map's heights [m]
-    "tilt_m": float,  # sigma of the displacement along the line by a horizontal ionospheric gradient [m]
-    "start_m": float,  # arc lengths of open ends [m]; infinite for closed ends
+    "sigma_plan_m": float,  # standard deviation of the map error across the line [m]
+    "sigma_height_m": float,  # standard deviation of the height error of the map [m]
+    "tilt_m": float,  # sigma of the position displacement along the line by a horizontal ionospheric gradient [m]
+    "start_m": float,  # arc lengths of the line's ends [m]; infinite for ends that close a lap
     "end_m": float,
-    "start_turn_m": float,  # lap lengths beyond start and end [m]; 0 for open ends
+    "start_turn_m": float,  # length of the lap that is closed at the start or end [m]; 0 at open ends
     "end_turn_m": float,
 })  # fmt: skip
 #: One source of faults, with the sub-filter that excludes it.
@@ -83,9 +83,9 @@ SOURCE: Final = record_of({
     "running": bool,  # True if the sub-filter exists
     "contradicted_s": float,  # time for which measurements have contradicted the sub-filter [s]
     "prior": float,  # probability of a fault; 0 for sources without a sub-filter
-    "k": float,  # factor K: normal quantile of the risk divided by `prior`
+    "k": float,  # factor K: normal quantile of the ratio risk / `prior`
     "k_speed": float,  # factor K for the speed
-    "clock": np.intp,  # index of a satellite's code clock in `CLOCKS`; 0 for other sources
+    "clock": np.intp,  # index in `CLOCKS` of a satellite's code clock; unused (0) for other sources
 })  # fmt: skip
 
 
@@ -95,7 +95,7 @@ class Given(NamedTuple):
     epoch: Records  #: `EPOCH`; shape (T,).
     channel: Records  #: `CHANNEL`; shape (T, K).
     sensor: Records  #: `SENSOR`; shape (T, C).
-    fresh: Masks  #: True where a satellite's code error begins at the epoch; shape (T, S).
+    fresh: Masks  #: True where a satellite's code error begins anew at the epoch; shape (T, S).
     within_memory: Masks  #: True where a satellite's code error continues from an earlier epoch; shape (T, S).
     vertex: Records  #: `VERTEX`; shape (V,).
     line: Records  #: `LINE`; shape (1,).
@@ -104,10 +104,10 @@ class Given(NamedTuple):
 
 
 class State(NamedTuple):
-    """State of the recursion with the Gaussians of H hypotheses and B sub-filters, changed in place."""
+    """State of the recursion, changed in place, with the Gaussians of H hypotheses and B sub-filters."""
 
     x: Floats  #: Means, hypotheses first, in the units of `index.py`; shape (H + B, N).
-    P: Floats  #: Covariances, in products of these units; shape (H + B, N, N).
+    P: Floats  #: Covariances, in products of the units of `x`; shape (H + B, N, N).
     hypothesis: Records  #: `railfix.tracking.state.HYPOTHESIS`; shape (H,).
     monitors: Records  #: `railfix.tracking.state.Monitors`; shape (1,).
     code_bias: Floats  #: Mean normalised innovation of each satellite's codes; shape (S,).
@@ -123,14 +123,14 @@ class Results(NamedTuple):
 
 
 class Trace(NamedTuple):
-    """Record of one epoch for the smoother: H hypotheses (0 without a record), N unknowns, up to M measurements."""
+    """Record of one epoch for the smoother: H hypotheses (H = 0: no record), N unknowns, at most M measurements."""
 
     prior: Floats  #: Covariances before the measurements; shape (H, N, N).
     row: Floats  #: Measurement matrix; shape (H, M, N). Rows of unused measurements are 0.
     value: Floats  #: Innovations, in the units of the measurements; shape (H, M).
-    variance: Floats  #: White variances divided by weights; shape (H, M); infinite for unused measurements.
+    variance: Floats  #: Variances of white errors divided by weights, infinite for unused measurements; shape (H, M).
     restarted: Masks  #: True for unknowns that have restarted; shape (H, N).
-    kept: Indices  #: Index before the epoch of each hypothesis after the epoch; shape (H,).
+    kept: Indices  #: For each hypothesis after the epoch, its index before the epoch; shape (H,).
 
 
 class Rows(NamedTuple):
@@ -141,10 +141,10 @@ class Rows(NamedTuple):
     phase: slice
     doppler: slice
     sensor: slice
-    channel: Indices  #: Channel of each row, or column of a sensor; shape (M,).
+    channel: Indices  #: Index of the channel of each row, for sensors of the column; shape (M,).
     #: White variances, including the adapted scales [m2, (m/s)2, squared units of sensors]; shape (M,).
     variance: Floats
     left_out: Masks  #: True for codes of satellites excluded as faulty; shape (M,).
-    code_s: float  #: Interval that the codes represent [s]: 0 if not used, the epoch's interval without codes.
+    code_s: float  #: Interval that the codes represent [s]: 0 if codes are not used, `interval_s` if there are none.
     degrees: float  #: Degrees of freedom of Student's t distribution of the errors.
     late_degrees: float  #: Degrees of freedom for codes that are longer than expected.

@@ -1,8 +1,8 @@
 """Protection level of the filtered position by solution separation; docs/filter-equations.md has the equation.
 
-Each fault hypothesis uses the risk that it requires, not an equal fraction (hypotheses of R. G. Brown and P. W.
-McBurney, 1988; allocation of J. Blanch et al., 2013, doi:10.1109/TAES.2013.6494396, here for a filter). The separations
-enlarge the bound, but are not tested, because robust filters can converge to different modes without a fault.
+Each fault hypothesis (R. G. Brown and P. W. McBurney, 1988) uses the risk that it requires, not an equal fraction
+(allocation of J. Blanch et al., 2013, doi:10.1109/TAES.2013.6494396). The separations enlarge the level but are not
+tested, because robust filters can converge to different modes even without a fault.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from railfix.kernels.tracking.subfilters import find_other
 class Alternatives(NamedTuple):
     """A alternative positions of the train with their probabilities; fields have shape (A,)."""
 
-    #: Distance along the line from the reported position; 0 beyond `start_separation_m`, where no level is solved.
+    #: Distance along the line from the reported position; 0 instead of distances above `start_separation_m`.
     along_m: Floats
     straight_m: Floats  #: Straight distance from the reported position.
-    forward_m: Floats  #: Component of this distance along the line at the alternative position.
+    forward_m: Floats  #: Component of `straight_m` along the tangent at the alternative position.
     sigma_m: Floats
     probability: Floats
 
 
 @inner
 def find_other_positions(given: Given, state: State) -> tuple[Alternatives, float]:
-    """Return all hypotheses except the first, and the total probability of hypotheses beyond `start_separation_m`."""
+    """Return all hypotheses but the first, and the probability of those beyond `start_separation_m` from the first."""
     others = slice(1, state.monitors[0].hypotheses)
     along = np.abs(state.x[others, ix.ARC] - state.x[0, ix.ARC])
     sigma = np.sqrt(state.P[others, ix.ARC, ix.ARC])
@@ -53,7 +53,7 @@ def find_other_positions(given: Given, state: State) -> tuple[Alternatives, floa
 
 @inner
 def widen_slow_code(slow_m: float, tilt_m: float, x: Floats, P: Floats) -> tuple[float, float]:
-    """Return arc length and variance of a Gaussian for a larger prior sigma `tilt_m` of the slow code error."""
+    """Return a Gaussian's arc length and variance for the prior slow code sigma `tilt_m` instead of `slow_m`."""
     less = 1.0 / slow_m**2 - 1.0 / tilt_m**2
     gain = P[ix.ARC, ix.SLOW_CODE] * less / (1.0 - less * P[ix.SLOW_CODE, ix.SLOW_CODE])
     return x[ix.ARC] + gain * x[ix.SLOW_CODE], P[ix.ARC, ix.ARC] + gain * P[ix.ARC, ix.SLOW_CODE]
@@ -61,7 +61,7 @@ def widen_slow_code(slow_m: float, tilt_m: float, x: Floats, P: Floats) -> tuple
 
 @inner
 def _find_subfilters(given: Given, t: int, state: State) -> Alternatives:
-    """Return the running sub-filters, and the filter widened for this epoch's ionosphere and a tilted ionosphere."""
+    """Return the running sub-filters, and the filter with larger slow code errors (disturbed or tilted ionosphere)."""
     first, size, most = len(state.hypothesis), 0, find_other(state, ix.ALL_IN_VIEW)
     away, sigma, probability = np.empty(most + 2), np.empty(most + 2), np.empty(most + 2)
     for b in range(most):
@@ -81,10 +81,10 @@ def _find_subfilters(given: Given, t: int, state: State) -> Alternatives:
 
 @inner
 def _cross(positions: Alternatives, subfilters: Alternatives, risk: float, level: float) -> tuple[Alternatives, float]:
-    """Return the positions on other branches with a faulty source, and the risk of positions that are not returned.
+    """Return the positions on other branches given a faulty source, and the risk of positions that are not returned.
 
-    A fault shifts the positions on all branches equally along the line. Positions whose risk is negligible at the
-    protection level so far (`PAIR_SHARE`) are not returned.
+    A fault shifts the positions on all branches equally along the line. Positions are not returned if their risk beyond
+    `level` is negligible (`PAIR_SHARE`).
     """
     most, size, spent = len(positions.sigma_m) * len(subfilters.sigma_m), 0, 0.0
     along, straight, sigma, probability = np.empty(most), np.empty(most), np.empty(most), np.empty(most)
@@ -106,11 +106,11 @@ def _cross(positions: Alternatives, subfilters: Alternatives, risk: float, level
 
 @inner
 def _find_pairs(state: State, risk: float, level: float) -> tuple[Alternatives, float]:
-    """Return the positions without both satellites of each pair, and the risk of pairs that are not returned.
+    """For pairs of satellites, return the position without the pair, and the risk of pairs that are not returned.
 
-    Information is assumed to be additive. Compared with a filter without both satellites, the standard deviation is
-    mostly within a tenth, but as low as half with few satellites. Pairs are not returned if their risk is negligible at
-    the protection level so far (`PAIR_SHARE`), or if the position is not bounded without the pair.
+    The information of satellites is assumed to be additive. The standard deviation mostly differs by less than 10 %
+    from that of a filter without both satellites; with few satellites, it can be half as large. Pairs are not returned
+    if their risk beyond `level` is negligible (`PAIR_SHARE`), or if the position without the pair is not bounded.
     """
     source, first, satellites, spent, size = state.source, len(state.hypothesis), len(state.code_bias), 0.0, 0
     most = satellites * (satellites - 1) // 2
@@ -135,7 +135,7 @@ def _find_pairs(state: State, risk: float, level: float) -> tuple[Alternatives, 
                 spent += prior
                 continue
             distance = abs(weighted_separation[i] - whole_separation + weighted_separation[j]) / remaining
-            # only the tail on the nearer side; the other tail is smaller
+            # only the tail towards the alternative; the opposite tail is smaller
             tail = prior * math.erfc((level - distance) * math.sqrt(0.5 * remaining))
             if tail < constants.PAIR_SHARE * risk:
                 spent += tail
@@ -147,7 +147,7 @@ def _find_pairs(state: State, risk: float, level: float) -> tuple[Alternatives, 
 
 @inner
 def find_unchecked(state: State) -> float:
-    """Return the fault probability of the only constellation in view, which has no sub-filter; 0 for several."""
+    """Return the fault probability of a constellation that is alone in view and has no sub-filter; otherwise 0."""
     source, satellites, total = state.source, len(state.code_bias), 0.0
     for g in range(ix.CLOCK_COUNT):
         in_view = source["running"][:satellites] & (source["clock"][:satellites] == g)
@@ -160,10 +160,10 @@ def find_unchecked(state: State) -> float:
 def write_level(given: Given, t: int, state: State, positions: Alternatives, unbounded: float, result: Record) -> None:
     """Write the protection levels of the first hypothesis, and their parts.
 
-    Both levels are infinite without sub-filters, with a sub-filter contradicted for longer than `LEVEL_DOUBT_S`, or if
-    faults of unbounded satellite pairs exceed the risk. The level along the line is also infinite if the probability
-    `unbounded` of positions beyond `start_separation_m` exceeds the risk. The level of the straight distance includes
-    all branches and a laterally displaced map.
+    Both levels are infinite if there are no sub-filters, if a sub-filter has been contradicted for longer than
+    `LEVEL_DOUBT_S`, or if the neglected alternatives use the whole risk. The level along the line is also infinite if
+    the probability `unbounded` of positions beyond `start_separation_m` exceeds the risk. The level of the straight
+    distance takes account of all branches and of a laterally displaced map.
     """
     parameters, source, first = given.parameters[0], state.source, len(state.hypothesis)
     others = find_other(state, ix.ALL_DOPPLERS)
@@ -174,7 +174,7 @@ def write_level(given: Given, t: int, state: State, positions: Alternatives, unb
         if source[b].running:
             contradicted = contradicted or source[b].contradicted_s > constants.LEVEL_DOUBT_S
             away = abs(state.x[first + b, ix.ARC] - state.x[0, ix.ARC])
-            # without the codes on one side, the separation is mostly noise
+            # without the codes ahead or behind, the separation is mostly noise and is not reported
             if b < others + ix.CODES_AHEAD or b > others + ix.CODES_BEHIND:
                 apart = away if math.isnan(apart) else max(apart, away)
             start = max(start, away + source[b].k * math.sqrt(state.P[first + b, ix.ARC, ix.ARC]))
@@ -216,7 +216,7 @@ def solve_level(sigma: float, distance: Floats, alternatives: Alternatives, risk
     """Return the level at which the position and the alternatives, at the distances `distance`, together use the risk.
 
     The solution is found by Newton steps on the logarithm of the risk, within a bracket. The steps start at the largest
-    level that a single alternative requires: below it, a branch can make the risk nearly constant.
+    level that a single alternative requires, because at lower levels, a branch can make the risk nearly constant.
     """
     level, own, probability = start, alternatives.sigma_m, alternatives.probability
     for a in range(len(own)):
@@ -246,7 +246,7 @@ def solve_level(sigma: float, distance: Floats, alternatives: Alternatives, risk
 
 @inner
 def bound_speed(parameters: Record, state: State, sigma: float) -> float:
-    """Return the bound of the speed error, with which the protection level is propagated to later epochs."""
+    """Return the bound of the speed error that is used to propagate the protection level to later epochs."""
     bound, first = parameters.level_k_speed * sigma, len(state.hypothesis)
     for b in range(find_other(state, ix.ALL_IN_VIEW)):
         if state.source[b].running:

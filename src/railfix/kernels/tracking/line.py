@@ -13,7 +13,7 @@ from railfix.kernels.tracking.layout import Record, Records
 
 @inner
 def wrap_arc(vertex: Records, line: Record, arc: float) -> float:
-    """Return the arc length on the line of a position beyond the end of a closed line (`Line.round_m`)."""
+    """Return the arc length; beyond an end of a closed line, shift it by whole laps into the line (`Line.round_m`)."""
     first, last = vertex[0].arc_m, vertex[-1].arc_m
     if arc > last and line.end_turn_m > 0.0:
         return float(arc - math.ceil((arc - last) / line.end_turn_m) * line.end_turn_m)
@@ -24,7 +24,7 @@ def wrap_arc(vertex: Records, line: Record, arc: float) -> float:
 
 @inner
 def nearest_arc(vertex: Records, line: Record, place: float, to: float) -> float:
-    """Return the arc length `place`, shifted by whole laps to be nearest to the arc length `to` (`Line.nearest_m`)."""
+    """Return arc length `place` plus the whole laps that bring it nearest to arc length `to` (`Line.nearest_m`)."""
     inside = wrap_arc(vertex, line, to)
     nearest = place
     if line.end_turn_m > 0.0 and place >= vertex[-1].arc_m - line.end_turn_m:

@@ -15,12 +15,12 @@ from railfix.kernels.tracking.layout import Given, Rows, State
 from railfix.kernels.tracking.model import restart
 from railfix.kernels.tracking.update import Equations, median
 
-TIE_S = 1e-6  #: Difference below which times count as equal [s]: their rounding depends on the first epoch.
+TIE_S = 1e-6  #: Times that differ by less than this count as equal [s], because they are rounded.
 
 
 @inner
 def _code_interval_s(given: Given, t: int, state: State) -> float:
-    """Return the interval [s] that an epoch's codes represent: 0 for unused codes, the epoch's interval without codes.
+    """Return the interval [s] that the codes represent: 0 if they are not used, the epoch's interval if there are none.
 
     Codes are not used if phases or Dopplers propagate the position and codes have been used within `code_period_s`.
     """
@@ -35,7 +35,7 @@ def _code_interval_s(given: Given, t: int, state: State) -> float:
 
 @inner
 def _is_sensor_used(given: Given, t: int, column: int, state: State) -> bool:
-    """Return True for a usable value; a distance without a sign requires a known direction, a range a minimum speed."""
+    """Return True if a sensor is used: unsigned distances require a known direction, and ranges a minimum speed."""
     sensor, monitors = given.sensor[t, column], state.monitors[0]
     used = math.isfinite(sensor.value) and (
         column < ix.RANGE_COLUMN or abs(state.x[0, ix.SPEED]) >= constants.STILL_MPS
@@ -84,10 +84,10 @@ def choose_measurements(given: Given, t: int, state: State) -> Rows:
 def start_clocks(
     given: Given, t: int, rows: Rows, offset_known: Masks, x: Floats, P: Floats, equations: Equations, restarted: Masks
 ) -> None:
-    """Start the clocks of an epoch in a predicted Gaussian, and subtract their changes from the innovations.
+    """Initialise the clocks of an epoch in a predicted Gaussian, and subtract the clock changes from the innovations.
 
-    The median innovation of codes is added to the code clock. The median innovations of phases and Dopplers are added
-    to the phase clock and the drift if unknown or stepped. `restarted`, shape (N,), is set for restarted unknowns.
+    The median innovation of codes is added to the code clock. If the phase clock is unknown or has stepped, the
+    median innovation of phases is added to it; likewise Dopplers and drift. `restarted`, shape (N,), marks restarts.
     """
     if rows.code.stop > 0:
         first = ix.OFFSETS + given.channel[t, rows.channel[0]].clock

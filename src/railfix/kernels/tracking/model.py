@@ -1,7 +1,7 @@
 """Process model of filter, sub-filters and smoother: transition F and process noise Q between epochs.
 
-docs/filter-equations.md tabulates F and Q. While measurements have no redundancy, the standard deviation of the speed
-grows, and consistent reflections from one wall can cause a wrong speed. `narrow_speed_range` limits this error.
+docs/filter-equations.md tabulates F and Q. Without redundant measurements, the standard deviation of the speed grows,
+and consistent reflections from one wall can then cause a wrong speed. `narrow_speed_range` limits this error.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def _add_noise(
             P[i, j] += epoch.noise[i, j]
     P[ix.ARC, ix.ARC] += constants.LEAST_STEP_M2
     P[ix.SPEED, ix.SPEED] += constants.LEAST_STEP_M2
-    walk = constants.CLOCK_WALK_MPS**2  # white noise of the drift, whose integral is the phase clock
+    walk = constants.CLOCK_WALK_MPS**2  # white noise of the drift; the phase clock is the integral of the drift
     P[ix.DRIFT, ix.DRIFT] += walk * dt
     P[ix.PHASE_CLOCK, ix.PHASE_CLOCK] += walk * dt**3 / 3.0 + _LEAST_CLOCK_M2
     P[ix.PHASE_CLOCK, ix.DRIFT] += walk * dt**2 / 2.0
@@ -138,7 +138,7 @@ def _add_noise(
     P[ix.RADAR, ix.RADAR] += constants.RADAR_WALK**2 * dt
     for i in range(ix.OFFSETS, ix.SATELLITES):
         P[i, i] += constants.OFFSET_WALK_M**2 * dt
-    # error of the map's displacement over the interval
+    # error of the displacement over the interval according to the map
     changed = 2.0 * (1.0 - math.exp(-travel / constants.MAP_CORRELATION_M))
     across = max(constants.MAP_ROUGHNESS_M, line.sigma_plan_m)
     above = max(constants.MAP_ROUGHNESS_M, constants.HEIGHT_ROUGHNESS * line.sigma_height_m)
@@ -153,7 +153,7 @@ def _add_noise(
 
 @inner
 def add_bend(given: Given, at: tuple[float, float], P: Floats) -> None:
-    """Increase the variances of lateral displacements where a position error in a bend changes the displacement.
+    """Increase the variances of lateral displacements in a bend, where a position error changes their direction.
 
     `at` has the arc lengths at this epoch and at the previous epoch [m].
     """
@@ -177,12 +177,12 @@ def restart(P: Floats, unknown: int, variance: float) -> None:
 
 @inner
 def narrow_speed_range(parameters: Record, monitors: Record, rows: Rows, speed: float, sigma: float, dt: float) -> bool:
-    """Return True if a measured speed is possible after the previous speeds, and narrow the range of possible speeds.
+    """Return True if a speed can follow the previous speeds, and narrow the range of possible speeds with it.
 
-    With several hypotheses, the range is unbounded. A speed outside the range is accepted if it comes from enough
-    satellites or from codes alone, or if an on-board sensor has measurements. After a rejected speed, the range grows
-    by emergency braking, so that braking is followed from the next epoch on. Without a measurement, `sigma` is
-    infinite, and the range grows by `service_acceleration_mps2`.
+    With several hypotheses, the range is unbounded. Other speeds are accepted if they come from at least
+    `trusted_satellites` satellites or from codes alone, or if an on-board sensor is used. After a rejected speed, the
+    range grows by the speed change of emergency braking, so that braking is followed from the next epoch on. Without a
+    measurement, `sigma` is infinite, and the range grows at `service_acceleration_mps2`.
     """
     low, high = -math.inf, math.inf
     if monitors.hypotheses == 1:

@@ -20,10 +20,10 @@ from railfix.kernels.tracking.subfilters import find_other
 
 @inner
 def compute_contradiction(given: Given, t: int, state: State, h: int) -> float:
-    """Return the squared normalised difference between measured velocity and line; NaN without a velocity.
+    """Return the squared normalised difference between measured velocity and line; NaN if no velocity is measured.
 
-    The square is the sum of the components along and across the line. It is computed at the estimated position and at
-    one position ahead and behind; the smallest value is returned.
+    The square is the sum of the squared components along and across the line. The smallest of three values is returned:
+    at the estimated position, at one position ahead of it and at one behind it.
     """
     epoch, line, x, P = given.epoch[t], given.line[0], state.x[h], state.P[h]
     velocity, covariance = epoch.velocity_mps, epoch.velocity_covariance

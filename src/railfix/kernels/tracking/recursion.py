@@ -104,9 +104,9 @@ def _start_correction(given: Given, t: int, state: State, rows: Rows, h: int) ->
 
 @inner
 def _correct_hypotheses(given: Given, t: int, state: State, rows: Rows) -> tuple[list[Correction], float]:
-    """Return the corrections of all hypotheses, and the code shift of the hypothesis reported so far.
+    """Return the corrections of all hypotheses, and the code shift of the one leading so far.
 
-    The equations are linearised again as long as a corrected position moves by more than `MOVED_M`.
+    Linearisation and correction are repeated while a corrected position moves by at least `MOVED_M`.
     """
     count = state.monitors[0].hypotheses
     corrections = [_start_correction(given, t, state, rows, h) for h in range(count)]
@@ -137,7 +137,7 @@ def _correct_hypotheses(given: Given, t: int, state: State, rows: Rows) -> tuple
 
 @inner
 def _relinearise(given: Given, t: int, state: State, rows: Rows, one: Correction) -> float:
-    """Correct again with equations linearised at the corrected position; return the change of this position [m]."""
+    """Repeat the correction, with equations linearised at the corrected position; return its change [m]."""
     arc, sign = one.x[ix.ARC], find_wheel_sign(one.x_prior, state.monitors[0].direction)
     linearise(given, t, rows, one.x_prior, (arc, one.x[ix.PREVIOUS_ARC]), sign, one.equations)
     covariance, without_clock = predict_quantities(one.P_prior, one.equations)
@@ -189,7 +189,7 @@ def _commit_update(given: Given, t: int, state: State, rows: Rows, corrections: 
 
 @inner
 def _write_measurements(t: int, rows: Rows, one: Correction, believed: bool, results: Results) -> None:
-    """Write innovations and weights; all weights are 0 if the measurements are not accepted (`believed`)."""
+    """Write innovations and weights; all weights are 0 if the measurements are rejected (`believed` is False)."""
     result, weight = results.epoch[t], one.fit.weight
     factor = 1.0 if believed else 0.0
     code, motion = mean_weights(rows, rows.variance, weight)
@@ -249,7 +249,7 @@ def _finish(given: Given, t: int, leading: int, state: State, trace: Trace) -> N
 
 @inner
 def _write_place(given: Given, t: int, status: int, state: State, results: Results) -> None:
-    """Write position, speed, levels and status. `status` is replaced if other branches or doubts exist."""
+    """Write position, speed, levels and status. `status` is replaced for several branches or doubts."""
     parameters, monitors, result = given.parameters[0], state.monitors[0], results.epoch[t]
     x, P = state.x[0], state.P[0]
     sigma = math.sqrt(P[ix.ARC, ix.ARC])
@@ -325,9 +325,9 @@ def advance(
 ) -> tuple[int, int]:
     """Process a span of epochs; return the epoch at which the recursion stopped, and reasons for a position search.
 
-    The recursion stops at an epoch that requires a position search, to which the state is only predicted. A call for
-    this epoch alone with `index.SOUGHT` completes it. The recursion also stops at a restart, after an epoch without a
-    finite position, and at the end of the span, with 0 as reasons.
+    The recursion stops at an epoch that requires a position search; the state is predicted to this epoch, but not
+    corrected. After the search, a call for this epoch alone with `index.SOUGHT` completes the epoch. With 0 as reasons,
+    it also stops before a restart, after an epoch without a finite position, and at the end of the span.
     """
     for t in range(span[0], span[1]):
         if sought == ix.NOT_SOUGHT:

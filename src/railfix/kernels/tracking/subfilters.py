@@ -35,7 +35,7 @@ from railfix.kernels.tracking.update import (
 
 @inner
 def find_other(state: State, which: int) -> int:
-    """Return the index in `State.source` of `index.ALL_DOPPLERS` or one of the following sources.
+    """Return the index in `State.source` of a source in `index`, from `index.ALL_DOPPLERS` on.
 
     The index is negative if levels are off.
     """
@@ -44,7 +44,7 @@ def find_other(state: State, which: int) -> int:
 
 @inner
 def _find_needed(given: Given, t: int, rows: Rows, state: State) -> Masks:
-    """Return True for the sources of an epoch's measurements, shape (B,). A single constellation is not included."""
+    """Return a mask, shape (B,), of the sources that are measured, except the only constellation in view."""
     needed, satellites = np.zeros(len(state.source), dtype=np.bool_), len(state.code_bias)
     others = find_other(state, ix.ALL_DOPPLERS)
     constellations = 0
@@ -70,9 +70,9 @@ def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Cor
     """Correct the predicted sub-filters; `leading` is the index of the leading hypothesis, `best` its correction.
 
     Each sub-filter has separate equations, because the line may bend between the positions of sub-filter and filter. A
-    sub-filter that measurements contradict restarts. For a source that the filter has not yet used, a copy of the
-    filter is the sub-filter. If all sub-filters restart, a sub-filter with all satellites in view restarts, too. It is
-    the reference for satellite pairs until it equals the filter.
+    sub-filter restarts if measurements contradict it. For a source that the filter has not yet used, the sub-filter is
+    a copy of the filter. If all sub-filters restart, a sub-filter with all satellites in view restarts, too. This
+    sub-filter replaces the filter as the reference for satellite pairs until both are equal.
     """
     source, first, satellites = state.source, len(state.hypothesis), len(state.code_bias)
     all_in_view = find_other(state, ix.ALL_IN_VIEW)
@@ -119,7 +119,7 @@ def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Cor
 
 @inner
 def _has_joined(x: Floats, P: Floats, best: Correction) -> bool:
-    """Return True if position and sigma of a sub-filter and of the filter agree within `JOINED`."""
+    """Return True if a sub-filter has the position and sigma of the filter within `JOINED` of its sigma."""
     sigma = math.sqrt(P[ix.ARC, ix.ARC])
     near = abs(x[ix.ARC] - best.x_prior[ix.ARC]) < constants.JOINED * sigma
     return near and sigma < (1.0 + constants.JOINED) * math.sqrt(best.P_prior[ix.ARC, ix.ARC])
@@ -127,7 +127,7 @@ def _has_joined(x: Floats, P: Floats, best: Correction) -> bool:
 
 @inner
 def _has_diverged(clock: int, P: Floats, variance: Floats) -> bool:
-    """Return True if a sub-filter without the constellation `clock` of `CLOCKS` no longer has measurements.
+    """Return True if a sub-filter without the constellation `clock` of `CLOCKS` is lost for lack of measurements.
 
     Its position is as uncertain as at a start, and gives no bound (`railfix.kernels.tracking.level.find_unchecked`).
     """
@@ -155,10 +155,10 @@ def _begin(given: Given, state: State, b: int, copied: bool, best: Correction) -
 
 @inner
 def rotate_map_error(given: Given, x: Floats, P: Floats) -> None:
-    """Rotate the displacement of a possibly wrong map relative to the line.
+    """Rotate the displacement of a possibly wrong map to the axes of the line at the new position.
 
     In a bend, a lateral displacement of the map becomes a displacement along the line. It changes the distance on the
-    map, not the distance measured by phases. The component that was along the line before the bend is unknown.
+    map, not the distance measured by phases. The component along the previous line is unknown.
     """
     axes, before, point = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     write_point(given.vertex, given.line[0], x[ix.ARC], point, axes)
@@ -205,7 +205,7 @@ def _exclude_source(given: Given, t: int, rows: Rows, state: State, b: int, equa
 def _correct(
     given: Given, t: int, rows: Rows, variance: Floats, best: Correction, x: Floats, P: Floats, sign: float
 ) -> Fit:
-    """Correct a predicted sub-filter (x, P) in place, with the initial clocks of the filter."""
+    """Correct a predicted sub-filter (x, P) in place, after copying the filter's clocks of this epoch to it."""
     equations, found = new_equations(rows), new_fit(rows)
     for i in range(len(x)):
         if best.restarted[i]:
@@ -224,7 +224,7 @@ def _correct(
 
 @inner
 def _update_contradiction(given: Given, t: int, rows: Rows, state: State, b: int, variance: Floats, found: Fit) -> None:
-    """Update the time for which low measurement weights have contradicted sub-filter `b`."""
+    """Update the time for which measurements have contradicted sub-filter `b`, as shown by low weights."""
     one = state.source[b]
     code, motion = mean_weights(rows, variance, found.weight)
     if code < constants.LOST_CODE_WEIGHT or motion < constants.LOST_MOTION_WEIGHT:

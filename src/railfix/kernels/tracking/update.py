@@ -1,6 +1,6 @@
-"""Sequential correction of Gaussians by an epoch's measurements with Student's t errors.
+"""Sequential correction of Gaussians by the measurements of an epoch, whose errors have Student's t distribution.
 
-The measurements depend on a Gaussian N(x, P) through the quantities ``q = H x`` of docs/filter-equations.md. The fits
+The measurements depend on the state N(x, P) through the quantities ``q = H x`` (docs/filter-equations.md). The fits
 correct the Gaussian of the quantities, N(0, H P H'), instead of the state. All phases and Dopplers are compressed to
 six rows. Measurements are processed one by one, so that no matrix is inverted.
 
@@ -33,9 +33,9 @@ class Equations(NamedTuple):
 
 
 class Fit(NamedTuple):
-    """Fit of one Gaussian to an epoch's measurements. Fields have shape (M,), the last two fields (1,)."""
+    """Fit of one Gaussian to an epoch's measurements. Fields have shape (M,), the last two have shape (1,)."""
 
-    #: Weight by Student's t distribution; 1 at an error of one standard deviation, less for a late code.
+    #: Weight from Student's t distribution: 1 for an error of one standard deviation; delayed codes have lower weights.
     weight: Floats
     residual: Floats  #: Innovation minus its fitted value, in the unit of the measurement.
     fitted: Floats  #: Variance of the fitted value, in the squared unit.
@@ -46,11 +46,11 @@ class Fit(NamedTuple):
 class Correction(NamedTuple):
     """Correction of one hypothesis with N unknowns by M measurements of an epoch."""
 
-    #: Predicted mean and covariance, with started clocks; shapes (N,) and (N, N).
+    #: Predicted mean and covariance with initialised clocks; shapes (N,) and (N, N).
     x_prior: Floats
     P_prior: Floats
     equations: Equations
-    #: Prior covariance of the quantities, shape (Q, Q), and its diagonal without the clocks, shape (Q,).
+    #: Prior covariance of the quantities, shape (Q, Q), and prior variances for known code clock, shape (Q,).
     covariance: Floats
     without_clock: Floats
     fit: Fit
@@ -106,7 +106,7 @@ def correct(x: Floats, P: Floats, g: Floats, innovation: float, variance: float,
 
 @inner
 def predict_quantities(P: Floats, equations: Equations) -> tuple[Floats, Floats]:
-    """Return the covariance H P H' of the quantities, shape (Q, Q), and its diagonal without the clocks, shape (Q,)."""
+    """Return the covariance H P H' of the quantities, shape (Q, Q), and variances without code clock, shape (Q,)."""
     unknown, coefficient = equations.unknown, equations.coefficient
     size = len(unknown)
     covariance, without_clock, g = np.empty((size, size)), np.empty(size), np.empty(len(P))
@@ -167,7 +167,7 @@ def compute_weight(rows: Rows, square: float, late: bool) -> float:
 
 @inner
 def median(values: Floats) -> float:
-    """Return the median; NaN without values."""
+    """Return the median; NaN if there are no values."""
     return float(np.median(values)) if len(values) else math.nan
 
 
@@ -175,9 +175,9 @@ def median(values: Floats) -> float:
 def write_first_weights(
     rows: Rows, equations: Equations, expected: tuple[Floats, Floats], variance: Floats, weight: Floats
 ) -> None:
-    """Write the initial weights, computed from innovations minus their median per GNSS measurement kind.
+    """Write the initial weights, computed from innovations minus the median for each kind of GNSS measurement.
 
-    The variances exclude the clocks, whose large prior variances would hide every outlier.
+    The predicted variances are computed without the clocks, whose large prior variances would hide every outlier.
     """
     covariance, without_clock = expected
     design, value, codes = equations.design, equations.value, rows.code.stop
@@ -203,7 +203,7 @@ def write_first_weights(
 
 @inner
 def fit(rows: Rows, equations: Equations, covariance: Floats, variance: Floats, found: Fit) -> None:
-    """Correct the quantities, ``N(0, covariance)``, with the weights of `found`; write the fit into `found`."""
+    """Correct the quantities, ``N(0, covariance)``, with the weights in `found`; write the results into `found`."""
     size, codes, value, weight = len(covariance), rows.code.stop, equations.value, found.weight
     mean, C, g, gain = np.zeros(size), covariance.copy(), np.empty(size), np.empty(size)
     T, z = np.empty((ix.MOTION, ix.MOTION)), np.empty(ix.MOTION)
@@ -331,7 +331,7 @@ def _add_quantity(equations: Equations, q: int, factor: float, P: Floats, mean: 
 
 @inner
 def compute_log_evidence(rows: Rows, variance: Floats, found: Fit) -> float:
-    """Return the log evidence of the measurements of finite variance by Laplace's method, with Student's t errors."""
+    """Return the log evidence of the measurements of finite variance (Laplace's method for Student's t errors)."""
     usual, density = rows.degrees, 0.0
     for j in range(len(rows.variance)):
         own = rows.late_degrees if j < rows.code.stop and found.residual[j] > 0.0 else usual
@@ -343,7 +343,7 @@ def compute_log_evidence(rows: Rows, variance: Floats, found: Fit) -> float:
 def mean_weights(rows: Rows, variance: Floats, weight: Floats) -> tuple[float, float]:
     """Return the mean weight of codes that are not excluded, and the mean weight of phases and Dopplers.
 
-    Only measurements of finite variance are included. A mean weight without measurements is NaN.
+    Only measurements of finite variance are included. A mean weight is NaN if there are no measurements.
     """
     code, motion, codes, motions = 0.0, 0.0, 0, 0
     for j in range(rows.doppler.stop):
@@ -359,7 +359,7 @@ def mean_weights(rows: Rows, variance: Floats, weight: Floats) -> tuple[float, f
 def compute_evidence(rows: Rows, one: Correction) -> tuple[float, float]:
     """Return the log evidence of all measurements except codes, and the log evidence of codes given all others.
 
-    An evidence is 0 with too few measurements, because these fit any speed and position.
+    An evidence is set to 0 if there are too few measurements, because they fit any speed and position.
     """
     joint = compute_log_evidence(rows, rows.variance, one.fit)
     without_codes, found = rows.variance.copy(), new_fit(rows)
@@ -376,7 +376,7 @@ def compute_evidence(rows: Rows, one: Correction) -> tuple[float, float]:
 
 @inner
 def refit_inflated_prior(rows: Rows, one: Correction) -> None:
-    """Fit again with initial weights for an inflated prior (position, speed), and keep the fit with more evidence."""
+    """Fit again with first weights for an inflated prior (position, speed); keep the fit with the larger evidence."""
     inflated, found = one.P_prior.copy(), new_fit(rows)
     inflated[ix.ARC, ix.ARC] += constants.FREEDOM_PLACE_M2
     inflated[ix.SPEED, ix.SPEED] += constants.FREEDOM_SPEED_M2PS2

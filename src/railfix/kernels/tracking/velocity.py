@@ -1,4 +1,4 @@
-"""Antenna velocities without the line, from carrier-phase changes or Dopplers.
+"""Antenna velocities from carrier-phase changes or Dopplers alone, without the line.
 
 Velocity and clock drift are fitted by reweighted least squares (Student's t errors), with a vertical velocity near 0.
 If the velocity points across the line, the position, the branch or the map is wrong.
@@ -22,7 +22,7 @@ from railfix.kernels.tracking.update import correct, median
 CLIMB_MPS = 0.3
 #: Standard deviation of the loose prior of velocity and clock drift [m/s], for conditioning.
 PRIOR_MPS = 1e3
-#: Degrees of freedom of the errors, number of fits, required redundancy, and least mean weight of a consistent fit.
+#: Degrees of freedom of Student's t errors; number of fits; least redundancy; least mean weight of a consistent fit.
 DEGREES = 4.0
 PASSES = 8
 REDUNDANT = 2
@@ -33,8 +33,8 @@ AGREEING = 0.9
 def write_velocities(epoch: Records, channel: Records, near_ecef_m: Floats, up: Floats) -> None:
     """Write velocities, covariances and ages from phases, or from Dopplers where phases give no velocity.
 
-    The velocity is NaN where the measurements are too few or inconsistent. A velocity from phases is valid half an
-    interval before the epoch. `epoch`, shape (T,), and `channel`, shape (T, K), are records `EPOCH` and `CHANNEL`.
+    The velocity is NaN where the measurements are too few or inconsistent. A velocity from phases refers to a time half
+    an interval before the epoch. `epoch`, shape (T,), and `channel`, shape (T, K), are records `EPOCH` and `CHANNEL`.
     `near_ecef_m`, shape (T, 3), are positions accurate to hundreds of metres, NaN if unknown. `up`, shape (T, 3), are
     the vertical unit vectors at these positions.
     """
@@ -68,11 +68,11 @@ def write_velocities(epoch: Records, channel: Records, near_ecef_m: Floats, up: 
 
 @inner
 def fit_velocity(h: Floats, y: Floats, r: Floats, count: int, up: Floats, velocity: Floats, covariance: Floats) -> bool:
-    """Fit velocity and clock drift; return False for too few or inconsistent measurements.
+    """Fit velocity and clock drift; return False if measurements are too few or inconsistent.
 
-    The first `count` rows of h, shape (M, 4), y and r, shape (M,), are coefficients, range rates [m/s] and variances of
-    measurements ``y = h . v + drift``. y is changed, and a vertical velocity of 0 is appended. The results are written
-    into `velocity`, shape (3,), and `covariance`, shape (3, 3), which is scaled by the residuals.
+    The first `count` rows are measurements ``y = h . v + drift``: coefficients h, shape (M, 4), range rates y [m/s] and
+    their variances r, both of shape (M,). y is changed, and a vertical velocity of 0 is appended. The results are
+    written into `velocity`, shape (3,), and `covariance`, shape (3, 3), which is scaled by the residuals.
     """
     if count - 3 < REDUNDANT:
         return False
