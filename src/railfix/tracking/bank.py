@@ -20,10 +20,10 @@ from railfix.tracking.limits import TrackingLimits
 
 #: Sensor name of each measurement kind.
 SENSORS: Final = {kind: kind.name.lower() for kind in Kind if kind >= Kind.WHEEL}
-#: Time between a constellation fault and the alert to users [s] (ARAIM milestone 3 report: one hour).
+#: Duration of a constellation fault until users are alerted [s] (ARAIM milestone 3 report: one hour).
 CONSTELLATION_FAULT_S: Final = 3600.0
-#: Negligible fraction of the risk. A kind of source has no sub-filters if the fault probability of `MOST_SOURCES` such
-#: sources is below this fraction.
+#: A kind of source has no sub-filters if the sum of the fault probabilities of `MOST_SOURCES` such sources is at most
+#: this fraction of the risk.
 SPARED: Final = 0.1
 MOST_SOURCES: Final = 64
 #: Risk allocated to the speed bound, as a fraction of the risk of the protection level.
@@ -31,7 +31,7 @@ SPEED_SHARE: Final = 0.01
 
 
 class SourceKind(IntEnum):
-    """Kind of a measurement source that has a sub-filter, in the order of `Budget.prior`."""
+    """Kinds of measurement sources that have sub-filters, in the order of `Budget.prior`."""
 
     SATELLITE = 0
     CONSTELLATION = 1
@@ -64,19 +64,19 @@ KINDS: Final = {
 
 @dataclass(frozen=True, kw_only=True)
 class Budget:
-    """Risk per independent error, fault probabilities, and the factors K computed from both."""
+    """Risk per independent error, fault probabilities, and factors K computed from risk and probabilities."""
 
     #: Risk per independent error, after subtraction of the fault probabilities of sources without a sub-filter.
     risk: float
     k: float  #: Two-sided normal quantile of the risk.
-    #: Probability per `SourceKind` that a source is faulty or that a past fault still affects the filter; 0 for kinds
-    #: without sub-filters.
+    #: For each `SourceKind`, probability that a source is faulty or that its past fault still affects the filter; 0 for
+    #: kinds without sub-filters.
     prior: tuple[float, ...]
-    #: One-sided normal quantile of risk / prior per `SourceKind`. It is the minimum factor K of a sub-filter's sigma,
-    #: and 0 for kinds without sub-filters.
+    #: For each `SourceKind`, one-sided normal quantile of risk / prior, which is the smallest factor K of the sigma of
+    #: a sub-filter; 0 for kinds without sub-filters.
     k_fault: tuple[float, ...]
-    #: Two-sided normal quantile for the speed bound. The fraction `SPEED_SHARE` of the risk is added for this bound and
-    #: divided equally among the sources.
+    #: Two-sided normal quantile for the speed bound, which has a separate risk: `SPEED_SHARE` times the risk, divided
+    #: equally among the sources.
     k_speed: float
     k_speed_fault: tuple[float, ...]  #: As `k_fault`, for the speed bound.
 
@@ -85,8 +85,8 @@ class Budget:
 def budget(limits: TrackingLimits) -> Budget:
     """Compute the risk budget of the protection level from the settings.
 
-    A constellation fault is assumed to last for `CONSTELLATION_FAULT_S`, any other fault as long as one independent
-    error. After its end, a fault still affects the state for `FORGOTTEN` code correlation times.
+    A constellation fault is assumed to last for `CONSTELLATION_FAULT_S`, any other fault for the duration of one
+    independent error. After its end, a fault still affects the state for `FORGOTTEN` code correlation times.
     """
     risk = limits.level_risk_per_hour / limits.level_samples_per_hour
     remembered_s = FORGOTTEN * constants.CODE_CORRELATION_S

@@ -19,7 +19,7 @@ from railfix.tracking.epochs import GnssEpochs, Previous
 from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.state import TrackState
 
-#: Minimum interval between epochs [s], also assumed for equal times: Dopplers and forces are divided by the interval.
+#: Minimum interval between epochs [s]; shorter intervals are set to it, because the interval is a divisor.
 _SHORTEST_S: Final = 1e-3
 #: Longest interval over which the filter continues [s]; the filter restarts after a longer interval.
 _APART_S: Final = 3600.0
@@ -121,7 +121,7 @@ def compute_singer_step(dt: float, sigma_mps2: float, tau_s: float) -> tuple[Flo
 
 
 def _write_velocities(epoch: Records, channel: Records, near_ecef_m: Floats) -> None:
-    """Write velocities computed without the line to the records `epoch`."""
+    """Compute velocities without the line, and write them to the records `epoch`."""
     from railfix.kernels.tracking.velocity import write_velocities
 
     latitude, longitude, _ = geodetic_from_ecef(np.where(np.isfinite(near_ecef_m), near_ecef_m, 1e6))
@@ -151,7 +151,7 @@ def _previous(channels: Strings, previous: Previous | None) -> tuple[Floats, Flo
 
 
 def _with_satellites(state: TrackState, satellite: Strings, measured: Masks) -> Indices:
-    """Add an unknown per newly observed satellite, and return each channel's satellite index, -1 if not observed."""
+    """Add an unknown for each new satellite; return each channel's satellite index, -1 for unobserved channels."""
     place = {name: k for k, name in enumerate(state.satellite.tolist())}
     names = satellite.tolist()
     new = [name for name in dict.fromkeys(satellite[measured].tolist()) if name not in place]

@@ -21,7 +21,7 @@ class Kind(IntEnum):
     RADAR = 4
     FORCE = 5
     PLACE = 6  # position from a feature of the line
-    BALISE = 7  # balises alternate with NEXT_BALISE, so that the protection level can exclude either
+    BALISE = 7  # alternates with NEXT_BALISE, so that the protection level can exclude one of two successive balises
     NEXT_BALISE = 8
     RANGE = 9  # two-way range to a ground unit
 
@@ -40,8 +40,8 @@ class GnssEpochs:
     code_sigma_m: Floats  #: Standard deviation of the code, including the receiver's noise scale, shape (T, K).
     phase_m: Floats  #: Carrier phase corrected for satellite clock and troposphere, shape (T, K).
     phase_joined: Masks  #: True where the phase continues from the previous epoch without a cycle slip, shape (T, K).
-    #: Range rate from the Doppler, positive for an increasing range, shape (T, K). It need not be corrected for
-    #: satellite clock drift and tropospheric rate, some millimetres per second each.
+    #: Range rate from the Doppler, positive for an increasing range, shape (T, K). Satellite clock drift and
+    #: tropospheric rate, a few millimetres per second each, need not be corrected.
     rate_mps: Floats
     cn0_dbhz: Floats  #: Carrier-to-noise density, shape (T, K).
     #: True where the train is known to be away from the line, shape (T,). At these epochs the filter is reset, and no
@@ -50,7 +50,7 @@ class GnssEpochs:
     #: Error of the ionospheric model divided by its error in a quiet ionosphere, shape (T,); None for 1. Values above 1
     #: increase sigma and protection level. The value is 0 for ionosphere-free codes.
     tilt_scale: Floats | None = None
-    #: Position computed without the line, accurate to some hundred metres, shape (T, 3). The antenna velocity is
+    #: Position computed without the line, accurate to a few hundred metres, shape (T, 3). The antenna velocity is
     #: computed at this position, and is not available where the position is NaN or None.
     near_ecef_m: Floats | None = None
 
@@ -72,7 +72,7 @@ class GnssEpochs:
 
 @dataclass(frozen=True, kw_only=True)
 class RangeEpochs:
-    """Two-way ranges to ground units since the previous epoch, up to R per epoch; NaN where absent."""
+    """Two-way ranges to ground units, measured since the previous epoch, up to R per epoch; NaN where absent."""
 
     range_m: Floats  #: Measured ranges, shape (T, R).
     sigma_m: Floats  #: Standard deviations of the ranges, shape (T, R).
@@ -119,16 +119,16 @@ class BaliseEpochs:
 
 @dataclass(frozen=True, kw_only=True)
 class SensorEpochs:
-    """Sensor measurements at the GNSS epochs, shape (T,) each; NaN where absent, None without the sensor."""
+    """Sensor measurements at the GNSS epochs, shape (T,) each; NaN where absent, None if there is no such sensor."""
 
     wheel_m: Floats | None = None  #: Wheel distance since the previous epoch, positive toward increasing chainage.
     wheel_sigma_m: Floats | None = None  #: Standard deviation of the wheel distance.
     #: "unknown" if the wheel distance has no sign. The filter then assigns the sign of the speed.
     wheel_sign: Literal["measured", "unknown"] = "measured"
-    #: Radar distance since the previous epoch. Oscillations of the vehicle body cancel in a distance (P2 3.2).
+    #: Radar distance since the previous epoch. Over the interval, oscillations of the vehicle body cancel (P2 3.2).
     radar_m: Floats | None = None
     radar_sigma_m: Floats | None = None
-    #: Mean specific force toward increasing chainage since the previous epoch, including gravity on the gradient.
+    #: Mean specific force since the previous epoch, toward increasing chainage, including gravity on a gradient.
     force_mps2: Floats | None = None
     force_sigma_mps2: Floats | None = None
     place_m: Floats | None = None  #: Arc length measured by recognising a feature of the line, such as a curve.

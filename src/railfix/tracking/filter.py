@@ -33,7 +33,7 @@ class Step:
     #: Means and covariances after the epoch, shapes (H, N) and (H, N, N).
     mean: Floats = field(default_factory=lambda: np.empty((0, 0)))
     covariance: Floats = field(default_factory=lambda: np.empty((0, 0, 0)))
-    #: Index of each hypothesis at the previous epoch, shape (H,); -1 for a new hypothesis.
+    #: For each hypothesis, its index at the previous epoch, shape (H,); -1 if it is new.
     parent: Indices = field(default_factory=lambda: np.empty(0, dtype=np.intp))
     splits: list[SplitHypothesis | None] | None = None  #: As `Sought.splits`.
     tilt_scale: float = 1.0  #: As `GnssEpochs.tilt_scale`.
@@ -46,7 +46,7 @@ class Recursion:
         self, chunk: Chunk, line: Line, sensors: SensorEpochs, limits: TrackingLimits, start_state: TrackState, *,
         levels: bool,
     ) -> None:  # fmt: skip
-        from railfix.kernels.tracking.recursion import advance  # imports numba, which is not needed without a filter
+        from railfix.kernels.tracking.recursion import advance  # imports numba: only if the filter is on
 
         self.kernel = advance
         self.chunk, self.line, self.limits, self.levels = chunk, line, limits, levels
@@ -144,7 +144,7 @@ def track(
     limits : TrackingLimits, optional
     sensors : SensorEpochs, optional
     levels : bool
-        If True, sub-filters compute a protection level at every epoch (`railfix.tracking.levels` uses a lower rate).
+        If True, sub-filters compute a protection level at every epoch. (`railfix.tracking.levels` has a lower rate.)
     trace : list of Step, optional
         List to which the record of each epoch is appended for the smoother (`railfix.tracking.smoother`).
 

@@ -1,4 +1,4 @@
-"""Protection level at every epoch, from a second filter with sub-filters that runs at a lower rate.
+"""Protection level at every epoch, from a second filter, which has sub-filters and runs at a lower rate.
 
 The sub-filters, at least one per satellite (`railfix.tracking.bank`), require much computing time, and codes of
 neighbouring epochs have nearly the same errors. The second filter therefore processes only one epoch per
@@ -28,9 +28,9 @@ from railfix.tracking.state import TrackState
 _SUMMED: Final = (("wheel_m", "wheel_sigma_m"), ("radar_m", "radar_sigma_m"), ("force_mps2", "force_sigma_mps2"))
 _MEAN: Final = np.array([False, False, True])  #: True for sensors whose values are averaged, not summed.
 #: Largest difference between filter and sub-filter that noise alone explains, in standard deviations of the filtered
-#: position: for positions without a protection level, and for positions with one.
+#: position: first for positions whose error is not bounded, then for positions with a bounded error.
 _EXPLAINED: Final = (3.0, 4.0)
-#: Largest finite protection level [m]. Larger ones result from sub-filters without measurements, and become infinite.
+#: Largest finite protection level [m]. Larger levels, from sub-filters without measurements, are set to infinity.
 LARGEST_LEVEL_M: Final = 1000.0
 _KEPT: Final = (
     "arc_m", "speed_mps", "level_m", "ground_level_m", "level_noise_m", "level_speed_mps", "separation_m",
@@ -46,9 +46,9 @@ class AccumulatedIncrement:
     start: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     number: int = -1  #: Number of periods from `start` to the last selected epoch; -1 before the first selected epoch.
     epochs: int = 0  #: Number of epochs since the last selected epoch.
-    #: Channels whose carrier phase has continued since the last selected epoch; None if no epoch has followed.
+    #: Channels whose carrier phase has continued since the last selected epoch; None if this is the last epoch.
     unbroken: frozenset[str] | None = None
-    #: Sums of wheel distances [m], radar distances [m] and forces [m/s2], and of their variances; shape (3,).
+    #: Sums of wheel distances [m], radar distances [m] and forces [m/s2]; sums of their variances; each of shape (3,).
     total: Floats = field(default_factory=lambda: np.zeros(3))
     variance: Floats = field(default_factory=lambda: np.zeros(3))
     balises: BaliseEpochs | None = None  #: Last balises read since the last selected epoch, stored as one epoch.
@@ -73,8 +73,8 @@ def decimate_epochs(
     before = np.maximum.accumulate(np.concatenate([[since.number], number]))
     taken = (before[1:] > before[:-1]).nonzero()[0]
     value, variance = _columns(sensors, len(epochs))
-    # Row 0 is the sum from the previous chunk, row t + 1 is epoch t. An interval ends with a selected epoch: if epochs
-    # 1 and 3 of epochs 0 to 4 are selected, the intervals are rows 0 to 2 and 3 to 4, and row 5 remains.
+    # Row 0 has the sums from the previous chunk; row t + 1 is epoch t. An interval ends with a selected epoch: if
+    # epochs 1 and 3 are selected, the intervals are rows 0 to 2 and rows 3 to 4; rows 5 onwards remain.
     goes_on = np.ones((len(epochs) + 1, len(epochs.channel)), dtype=np.bool_)
     if since.unbroken is not None:
         goes_on[0] = [name in since.unbroken for name in epochs.channel.tolist()]
@@ -135,7 +135,7 @@ class LevelState:
     """State of the filter with sub-filters after a chunk."""
 
     track: TrackState | None = None
-    every: bool = True  #: True while this filter has used every epoch and so equals the main filter.
+    every: bool = True  #: True while this filter has used every epoch and therefore equals the main filter.
     since: AccumulatedIncrement = field(default_factory=AccumulatedIncrement)
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Last epoch of this filter.
     #: Results `_KEPT` of this filter at its last epoch, shape (10,); NaN before the first epoch.
@@ -206,8 +206,8 @@ def carried_levels(
     level = np.where(bounded | ~known, widened(level, np.abs(tracked.arc_m - carried)), np.inf)
     amount = np.fmax(level, amount + constants.SCALE_BOUND * np.abs(speed) * tau)
     reported = _status(tracked.status, status, level)
-    # Sigma of a doubtful position includes the whole of the largest separation; other sigmas include only the part of
-    # the separation that noise does not explain.
+    # The sigma of a doubtful position includes the whole largest separation. For other positions, it only includes the
+    # part of the separation that noise does not explain.
     doubt = (reported == TrackStatus.DOUBTFUL) | ~np.isfinite(ground)
     explained = np.where(is_bounded(reported), _EXPLAINED[1], _EXPLAINED[0]) * tracked.sigma_m
     apart = np.where(np.isnan(separation), 0.0, separation)

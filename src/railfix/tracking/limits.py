@@ -16,8 +16,8 @@ class Tails(NamedTuple):
     """Degrees of freedom of the Student t distribution of measurement errors."""
 
     usual: float
-    #: Degrees of freedom for codes longer than expected: a reflected signal arrives late, and its excess path has no
-    #: typical length. Small errors of either sign have the same weight.
+    #: Degrees of freedom for codes longer than expected. They are fewer, because reflected signals arrive late, by
+    #: excess paths of any length. Small errors of both signs have equal weights.
     late: float
 
     def weight(self, residual: Floats, square: Floats) -> Floats:
@@ -32,45 +32,45 @@ class Tails(NamedTuple):
 
 
 class TrackingLimits(Settings):
-    """Process and measurement noise of the filter, and criteria for keeping and searching branches."""
+    """Process and measurement noise of the filter, and criteria for keeping branches and searching for them."""
 
     #: Standard deviation and correlation time of the acceleration along the track (R. A. Singer, 1970). Trains brake
     #: and accelerate at up to 1.3 m/s2 for some seconds; road vehicles reach higher rates for shorter times.
     acceleration_mps2: float = Field(default=1.0, gt=0)
     acceleration_s: float = Field(default=2.0, gt=0)
-    #: Largest acceleration that is accepted if fewer than `trusted_satellites` satellites and no speed sensor measure
-    #: the speed. Near a wall or under a station roof, such a speed may come from consistent reflections alone
+    #: Largest accepted acceleration if the speed is measured by fewer than `trusted_satellites` satellites and by no
+    #: sensor. Near a wall or under a station roof, such a speed may come from consistent reflections alone
     #: (`kernels.tracking.model.narrow_speed_range`).
     service_acceleration_mps2: float = Field(default=1.5, gt=0)
     trusted_satellites: int = Field(default=7, ge=0)
     #: Degrees of freedom of the Student t distribution of measurement errors; 4 fits urban code errors.
     degrees_of_freedom: float = Field(default=4.0, gt=2)
     #: Degrees of freedom for codes longer than expected. Reflections arrive late, and with one degree of freedom
-    #: (Cauchy) their mean delay is unbounded. The value was chosen from 0.4, 1 and 4 (symmetric) on logs from Hong Kong
-    #: and California. Positions improve equally in logs that were not used for the choice (docs/filter.md).
+    #: (Cauchy) their mean delay is unbounded. The value was chosen from 0.4, 1 and 4 (as for short codes) on logs from
+    #: Hong Kong and California. Positions improve as much in logs that were not used for the choice (docs/filter.md).
     late_degrees_of_freedom: float = Field(default=1.0, gt=0)
-    #: Standard deviation of the white part of the code error in one second, as a fraction of the code sigma.
+    #: Standard deviation of the white code error, averaged over one second, as a fraction of the code sigma.
     code_white_share: float = Field(default=1.0, gt=0)
     #: Interval at which codes are used while phases or Dopplers propagate the position; 0 for every epoch. Code errors
     #: last about a minute, so that codes at intermediate epochs add no information.
     code_period_s: float = Field(default=1.0, ge=0)
-    #: Standard deviation of the displacement along the line by orbit and ionospheric errors: about 1 m per satellite,
-    #: with a dilution of precision of one. The errors last for hours, so that averaging does not reduce them.
+    #: Standard deviation of the position displacement along the line by orbit and ionospheric errors: errors of about 1
+    #: m per satellite, and a dilution of precision of one. The errors last for hours; averaging does not reduce them.
     slow_code_m: float = Field(default=1.0, ge=1e-6)
-    #: Doppler noise: ``sigma^2 = floor^2 + (zenith 10^((45 - C/N0) / 20))^2``, with C/N0 limited to 50 dB-Hz, or 45
-    #: dB-Hz if C/N0 is unknown.
+    #: Doppler noise: ``sigma^2 = floor^2 + (zenith 10^((45 - C/N0) / 20))^2``, with C/N0 of at most 50 dB-Hz; an
+    #: unknown C/N0 counts as 45 dB-Hz.
     doppler_floor_mps: float = Field(default=0.03, gt=0)
     doppler_zenith_mps: float = Field(default=0.05, gt=0)
-    #: Floor and zenith value of the noise formula of Dopplers, for the change of a carrier phase between two epochs.
+    #: Floor and zenith value for the change of a carrier phase between two epochs, in the noise formula of Dopplers.
     phase_floor_m: float = Field(default=0.01, gt=0)
     phase_zenith_m: float = Field(default=0.01, gt=0)
-    #: Largest mean innovation over half a minute that the assumed length error of the map explains, in sigmas.
+    #: The assumed length error of the map increases if the mean code shift of half a minute exceeds this, in sigmas.
     map_misfit_sigmas: float = Field(default=3.0, gt=0)
     most_hypotheses: int = Field(default=24, ge=1)  #: Largest number of hypotheses; the most probable ones are kept.
-    start_separation_m: float = Field(default=60.0, gt=0)  #: Smallest distance between the positions of a search.
+    start_separation_m: float = Field(default=60.0, gt=0)  #: Smallest distance between positions that a search finds.
     #: "on" to compute a protection level with a bank of sub-filters, about one per satellite.
     level: Literal["on", "off"] = "on"
-    #: Interval of the epochs that the bank processes. Codes of neighbouring epochs have nearly the same errors.
+    #: Interval between epochs that the sub-filters use. Codes of neighbouring epochs have nearly the same errors.
     level_period_s: float = Field(default=1.0, gt=0)
     #: Largest acceleration assumed between the bank's epochs. Emergency braking reaches 3 m/s2 (magnetic track brakes).
     #: After a rejected speed, the range of accepted speeds grows at this rate.
@@ -87,16 +87,16 @@ class TrackingLimits(Settings):
     #: Probability that an on-board sensor is faulty in one independent sample. The value is an assumption.
     level_sensor_prior: float = Field(default=1e-3, ge=0, lt=1)
     #: Probability that a balise is not at its listed position. The value is an assumption. A small value is required,
-    #: because the protection level does not cover two balises wrong at the same time.
+    #: because the protection level does not cover two balises that are wrong at the same time.
     level_balise_prior: float = Field(default=1e-6, ge=0, le=3e-6)
     #: Probability that all Dopplers, or all phases, are wrong together. The value is an assumption.
     level_motion_prior: float = Field(default=1e-5, ge=0, lt=1)
-    #: Probability that the codes of all satellites ahead, or of all satellites behind, are late at the same time. In
-    #: single epochs, this occurs with low satellites on one side. The value is an assumption.
+    #: Probability that the codes of all satellites ahead, or of all satellites behind, are late at the same time, as
+    #: the codes of low satellites on one side are in some epochs. The value is an assumption.
     level_side_prior: float = Field(default=SUPPORTED_SIDE_PRIOR, ge=0, lt=1)
-    #: Probability that the map is wrong by more than its stated sigma, and sigma of this wrong map. Both are assumed.
+    #: Probability that the map is wrong by more than its stated sigma; sigma of the map in this case. Both are assumed.
     level_map_prior: float = Field(default=1e-3, ge=0, lt=1)
     level_map_m: float = Field(default=30.0, gt=0)
-    #: Probability of an ionospheric storm or the equatorial anomaly, which displace positions along the line with the
-    #: sigma `tracking.line.TILT_M` instead of `slow_code_m`. The value is an assumption.
+    #: Probability of an ionospheric storm or the equatorial anomaly. The sigma of slow code errors is then
+    #: `tracking.line.TILT_M` instead of `slow_code_m`. The value is an assumption.
     level_tilt_prior: float = Field(default=1e-3, ge=0, lt=1)

@@ -13,15 +13,15 @@ from railfix.kernels.tracking.layout import LINE, VERTEX, Records
 from railfix.ranges.atmosphere import geomagnetic_latitude
 from railfix.track.trajectory import Trajectory
 
-#: Standard deviation of the displacement along the line by a horizontal gradient of the ionosphere [m], for geomagnetic
-#: latitudes up to 20 deg, up to 55 deg, and beyond. It is 2/9 of the vertical-delay sigma without SBAS in DO-229D
-#: J.2.3, which is 9 m, 4.5 m and 6 m. `GnssEpochs.tilt_scale` multiplies this sigma and `slow_code_m` at each epoch.
+#: Standard deviation of the position displacement along the line by a horizontal gradient of the ionosphere [m], for
+#: geomagnetic latitudes up to 20 deg, up to 55 deg, and beyond. It is 2/9 of the vertical-delay sigmas without SBAS (9
+#: m, 4.5 m, 6 m) in DO-229D J.2.3. `GnssEpochs.tilt_scale` multiplies this sigma and `slow_code_m` at each epoch.
 TILT_M: Final = (2.0, 1.0, 1.33)
 _TILT_LATITUDES_DEG: Final = (20.0, 55.0)
 
 
 class Line:
-    """Trajectory of V points with smooth axes. Open lines continue straight at their ends, closed lines as a loop."""
+    """Trajectory of V points with smooth axes. Open lines go on straight at their ends; closed lines form loops."""
 
     def __init__(self, trajectory: Trajectory) -> None:
         self.trajectory = trajectory
@@ -34,7 +34,7 @@ class Line:
 
     @cached_property
     def axes(self) -> Floats:
-        """Axes at the points, shape (V, 3, 3), with the rows tangent (mean direction of two segments), right and up."""
+        """Axes at the points, shape (V, 3, 3): rows tangent (mean of adjacent segments), right and up."""
         segment, up = self.segment, self.trajectory.up
         tangent = np.concatenate([segment[:1], segment[:-1] + segment[1:], segment[-1:]])
         tangent = tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -66,7 +66,7 @@ class Line:
         return bool(np.isfinite(self.joins_m).any())
 
     def round_m(self, arc_m: Floats) -> Floats:
-        """Return the shift [m] that moves positions beyond an end of a closed line back onto the line; 0 for others."""
+        """Return the shift [m] that moves positions beyond an end of a closed line back onto the line, or 0."""
         back = np.zeros(np.shape(arc_m))
         first, last = self.arc_m[0], self.arc_m[-1]
         for excess, turn in ((arc_m - last, last - self.joins_m[1]), (first - arc_m, first - self.joins_m[0])):

@@ -13,14 +13,14 @@ from railfix.kernels.tracking.index import TrackStatus as TrackStatus
 from railfix.kernels.tracking.layout import Results, record_of
 from railfix.tracking.epochs import Kind
 
-#: Statuses in which the protection level bounds the error. The error is not bounded away from the map, with several
-#: possible branches, or on a doubtful track.
+#: Statuses in which the protection level bounds the error. The error is not bounded if the train is off the map, if
+#: several branches are possible, or if the position is doubtful.
 BOUNDED: Final = (TrackStatus.TRACKING, TrackStatus.COASTING)
 _IS_BOUNDED: Final = np.array([status in BOUNDED for status in TrackStatus])
 
 
 def is_bounded(status: Codes) -> Masks:
-    """Return True for statuses in `BOUNDED`, same shape."""
+    """Return a mask of statuses that are in `BOUNDED`."""
     return np.asarray(_IS_BOUNDED[status])
 
 
@@ -30,8 +30,8 @@ class Tracked(NotebookTable):
 
     time: Datetimes  #: Time of each epoch, shape (T,).
     status: Codes  #: Values of `TrackStatus`, shape (T,).
-    #: Arc length and standard deviation of the most probable hypothesis, shape (T,). The standard deviation includes
-    #: the straight distance to other hypotheses, and differences from sub-filters that noise does not explain.
+    #: Arc length and standard deviation of the most probable hypothesis, shape (T,). The standard deviation covers the
+    #: straight distance to other hypotheses, and differences from sub-filters beyond those due to noise.
     arc_m: Floats
     sigma_m: Floats
     speed_mps: Floats  #: Speed along the line, shape (T,).
@@ -44,24 +44,24 @@ class Tracked(NotebookTable):
     wheel_scale: Floats  #: Estimated scale-factor error of the wheel, shape (T,).
     force_offset_mps2: Floats  #: Estimated accelerometer offset, shape (T,).
     radar_scale: Floats  #: Estimated scale-factor error of the radar, shape (T,).
-    #: Factor on the assumed error of map lengths, shape (T,); 1 if codes do not contradict the map lengths.
+    #: Factor of the assumed error of map lengths, shape (T,); 1 if codes do not contradict the map lengths.
     map_scale: Floats
     level_m: Floats  #: Protection level of the error along the line, shape (T,); NaN where levels are off.
     #: Protection level of the straight distance, shape (T,), including other branches and lateral errors of the map.
     ground_level_m: Floats
-    level_noise_m: Floats  #: Protection level of a single branch for noise without faults, shape (T,).
+    level_noise_m: Floats  #: Protection level for noise alone, without faults or other branches, shape (T,).
     #: Bound of the speed error, used to propagate protection levels to later epochs, shape (T,).
     level_speed_mps: Floats
     #: Largest difference between filter and sub-filter, shape (T,); NaN where levels are off.
     separation_m: Floats
-    #: Probability of faults that the level does not bound, such as a fault of the only constellation, shape (T,).
+    #: Probability of faults that the level does not cover, such as a fault of the only constellation, shape (T,).
     unchecked_prior: Floats
-    #: Over- and under-reading amount (SUBSET-026 3.6.8), shape (T,): the protection level, but at least the bound of
-    #: the scale error times the distance since codes were last used.
+    #: Over- and under-reading amount (SUBSET-026 3.6.8), shape (T,): the protection level, but at least the largest
+    #: scale error (`SCALE_BOUND`) times the distance since codes were used.
     amount_m: Floats
     used: Integers  #: Number of measurements of each kind with a weight above a half, shape (T, len(Kind)).
     innovation: Floats  #: Innovations of codes, phase changes and Dopplers, shape (T, 3, K).
-    #: Innovations of the sensors in the order of `Kind`, shape (T, len(Kind) - 3); the last one of several ranges.
+    #: Innovations of the sensors in the order of `Kind`, shape (T, len(Kind) - 3); of several ranges, only the last.
     sensed: Floats
     weight: Floats  #: Weights of codes, phase changes and Dopplers, shape (T, 3, K); 0 for excluded codes.
     faulty: Masks  #: True for excluded codes (`railfix.kernels.tracking.adaptation`), shape (T, K).

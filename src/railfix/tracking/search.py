@@ -20,22 +20,22 @@ from railfix.tracking.state import ANY_SPEED, HYPOTHESIS, TrackState
 #: Largest spacing of the points at which the line is searched [m]. A Gaussian of `START_SIGMA_M` covers the positions
 #: between two points, and the code variance includes the distance to the nearest point.
 _SPACING_M: Final = 15.0
-#: Minimum number of redundant codes for a search. A wrong position can fit a single redundant code equally well.
+#: Minimum number of redundant codes for a search. A wrong position can fit one redundant code too.
 REDUNDANT: Final = 2
 #: A position becomes a hypothesis only if its log likelihood is within this difference of the maximum.
 _WORSE: Final = 25.0
 _ANY_SPEED_MPS: Final = 50.0  #: Prior standard deviation of the speed [m/s]; no train is faster than twice this speed.
 _ANY_DRIFT_MPS: Final = 1e3  #: Prior standard deviation of the clock drift [m/s].
-_FIRST_STEP_M: Final = 1.0  #: Standard deviation of the map displacement before the first epoch [m].
+_FIRST_STEP_M: Final = 1.0  #: Prior sigma of the map's displacement error at the first epoch [m].
 WHEEL_PRIOR: Final = 0.02  #: Prior standard deviation of the wheel's scale-factor error.
 FORCE_PRIOR_MPS2: Final = 0.1  #: Prior standard deviation of the accelerometer offset, including the mounting.
 RADAR_PRIOR: Final = 0.02  #: Prior standard deviation of the radar's scale-factor error.
 _BESIDE_STEPS: Final = np.array([-2.0, -1.0, 1.0, 2.0])  #: Distances to neighbouring hypotheses, in units of `BEND_M`.
 _BESIDE: Final = len(_BESIDE_STEPS)  #: Number of neighbouring hypotheses per hypothesis.
-_BEND_SPEED_MPS: Final = 10.0  #: Standard deviation added to the speed of neighbouring hypotheses [m/s].
-#: Total probability of the neighbours of a hypothesis, as a fraction of its probability.
+_BEND_SPEED_MPS: Final = 10.0  #: Increase of the speed sigma of neighbouring hypotheses, in quadrature [m/s].
+#: Total probability of the neighbours of a hypothesis, as a fraction of this hypothesis's probability.
 _BESIDE_SHARE: Final = 0.01
-#: Unknowns that a new hypothesis copies from a lost track. Other unknowns are affected by the track's position error.
+#: Unknowns that a new hypothesis copies from a lost track. Other unknowns are affected by the error of the lost track.
 _KEPT: Final = np.array([ix.WHEEL, ix.FORCE_OFFSET, ix.RADAR])
 
 
@@ -85,8 +85,8 @@ def begin(
 ) -> tuple[Floats, Floats]:  # fmt: skip
     """Return means, shape (H, N), and covariances, shape (H, N, N), of new hypotheses at `arc_m` [m], shape (H,).
 
-    `satellites` is the number of satellite errors in the state. `known` are the mean and covariance of a lost track,
-    whose sensor errors are kept. Clocks and satellite errors restart.
+    `satellites` is the number of satellite errors in the state. `known` are the mean and covariance of a lost track;
+    their sensor errors are kept. Clocks and satellite errors restart.
     """
     width = ix.SATELLITES + satellites
     mean = np.zeros((len(arc_m), width))
@@ -98,7 +98,7 @@ def begin(
     variance[:, ix.DRIFT] = _ANY_DRIFT_MPS**2
     variance[:, ix.MAP_RIGHT] = line.sigma_plan_m**2
     variance[:, ix.MAP_UP] = line.sigma_height_m**2
-    # before the first epoch no position is known, so that the map displacement since then is almost unknown
+    # before the first epoch no position is known, and the map displacement since then is almost unknown
     variance[:, [ix.STEP_RIGHT, ix.STEP_UP, ix.MAP_LENGTH_ERROR]] = _FIRST_STEP_M**2
     variance[:, ix.SLOW_CODE] = limits.slow_code_m**2
     variance[:, ix.DOPPLER_SPEED] = constants.DOPPLER_ERROR_MPS**2
@@ -117,7 +117,7 @@ def begin(
     return mean, covariance
 
 
-#: Probability of other positions if the velocity contradicts the position; low, because a wrong map may be the cause.
+#: Total probability of new positions if the velocity contradicts the position; low, because the map may be wrong.
 _ELSEWHERE: Final = 0.01
 
 
@@ -137,7 +137,7 @@ class Sought(NamedTuple):
 
     lost: bool  #: True if the search followed a loss of track.
     parent: Indices  #: Index of each hypothesis at the previous epoch, shape (H,); -1 for a new hypothesis.
-    #: Split that produced each hypothesis (None for other hypotheses), or None if no hypothesis was split.
+    #: For each hypothesis, the split that produced it, or None. The list is None if no hypothesis was split.
     splits: list[SplitHypothesis | None] | None
 
 
@@ -161,7 +161,7 @@ def _join(state: TrackState, parts: list[_Part]) -> None:
 def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits, reasons: int) -> Sought:
     """Search for positions at an epoch, and add hypotheses to the state predicted to this epoch.
 
-    `reasons` are bits of `kernels.tracking.index` (`LOST_TRACK`, `GAP`, `CONTRADICTED`), ignored without a hypothesis.
+    `reasons` are bits of `kernels.tracking.index` (`LOST_TRACK` and following), ignored if there is no hypothesis.
     """
     if not state.hypotheses:
         arc = places(chunk, epoch, line, limits)
@@ -194,7 +194,7 @@ def seek(state: TrackState, chunk: Chunk, epoch: int, line: Line, limits: Tracki
 
 
 def _start_branches(state: TrackState) -> None:
-    """Reset the time and distance since the start of the hypotheses, and their evidence."""
+    """Reset the evidence of the hypotheses, and the time and distance since their start."""
     state.hypothesis["log_least"], state.hypothesis["log_recent"] = state.hypothesis["log_probability"], 0.0
     state.monitors = replace(state.monitors, branch_s=0.0, branch_m=0.0)
 
@@ -219,8 +219,8 @@ def _split_wide(
 ) -> tuple[list[_Part], list[SplitHypothesis | None]]:
     """Return narrow hypotheses at those positions `arc_m` [m] that lie within `wide` hypotheses, and `Sought.splits`.
 
-    A narrow hypothesis is the wide hypothesis conditioned on one position with the standard deviation `START_SIGMA_M`.
-    Its probability is proportional to the density of the wide hypothesis at this position.
+    A narrow hypothesis is the wide hypothesis corrected by a position measurement of standard deviation
+    `START_SIGMA_M`. Its probability is proportional to the density of the wide hypothesis at the measured position.
     """
     parts: list[_Part] = []
     splits: list[SplitHypothesis | None] = [None] * state.hypotheses
@@ -247,7 +247,7 @@ def _split_wide(
 
 
 def _begin_elsewhere(state: TrackState, arc: Floats, line: Line, limits: TrackingLimits, *, weak: bool) -> _Part:
-    """Return hypotheses at positions `arc` away from a lost track. `weak` is True if low weights caused the loss."""
+    """Return hypotheses at arc lengths `arc` after a loss of track. `weak` is True if low weights caused the loss."""
     log_probability = state.hypothesis["log_probability"]
     best = int(np.argmax(log_probability))
     elsewhere = 1.0 if weak or state.monitors.contradiction >= constants.CONTRADICTION_TAKEN else _ELSEWHERE
@@ -266,9 +266,9 @@ def _begin_elsewhere(state: TrackState, arc: Floats, line: Line, limits: Trackin
 def _try_beside(state: TrackState, line: Line, limits: TrackingLimits) -> int:
     """Add hypotheses a short distance ahead of and behind each hypothesis; return the number of added hypotheses.
 
-    Where a line turns back within some tens of metres, the Dopplers agree equally with forward travel on one leg and
-    backward travel on the other leg, and equations linearised before the bend are not valid beyond the bend. Every lap
-    gets neighbours, because neighbours of the most probable lap alone would make other laps less probable.
+    Where a line turns back within some tens of metres, Dopplers fit forward travel before the bend as well as backward
+    travel beyond it, and equations linearised before the bend are not valid beyond it. Every lap gets neighbours,
+    because neighbours of the most probable lap alone would make other laps less probable.
     """
     parents: list[int] = []
     room = (limits.most_hypotheses - state.hypotheses) // _BESIDE

@@ -32,7 +32,7 @@ def _carry_through_measurements(step: Step, h: int, vector: Floats, matrix: Floa
         )
     part = None if step.splits is None else step.splits[h]
     if part is not None:
-        # The density of the narrow hypothesis divided by that of the wide hypothesis acts as a position measurement.
+        # A split acts as a position measurement: density of the narrow hypothesis divided by density of the wide one.
         place = ix.ARC
         wide = part.covariance[place, place]
         back = np.eye(len(vector))
@@ -55,9 +55,9 @@ def transition(mean: Floats, dt: float, limits: TrackingLimits) -> Floats:
 
 @dataclass(frozen=True, kw_only=True)
 class BackwardInformation:
-    """Information of all later epochs on the unknowns after an epoch."""
+    """Information from all later epochs about the unknowns at the end of an epoch."""
 
-    place_m: float  #: Arc length of the hypothesis that continues in later epochs; NaN without such a hypothesis.
+    place_m: float  #: Arc length of the hypothesis that continues in later epochs; NaN if there is none.
     vector: Floats  #: Information vector of the unknowns, shape (N,).
     matrix: Floats  #: Information matrix of the unknowns, shape (N, N).
     satellite: Strings  #: Satellites whose errors are among the unknowns, shape (N - ix.SATELLITES,).
@@ -127,7 +127,7 @@ def smooth_steps(
 
 
 def _ionosphere_m2(step: Step, h: int, vector: Floats, matrix: Floats, quiet_m: float) -> float:
-    """Return the increase of the variance along the line [m^2] if an epoch's ionosphere is not quiet."""
+    """Return the increase of the variance along the line [m^2] by an ionosphere that is not quiet, otherwise 0."""
     both = step.covariance[h][[ix.ARC, ix.SLOW_CODE]]
     P = both[:, [ix.ARC, ix.SLOW_CODE]] - both @ matrix @ both.T
     less = (1.0 - max(step.tilt_scale, 1.0) ** -2) / quiet_m**2

@@ -28,28 +28,28 @@ class Monitors:
     #: Mean position shift implied by the codes of the last epochs, in standard deviations.
     code_shift: float = 0.0
     code_shift_variance: float = 0.0  #: Variance of `code_shift`.
-    #: Logarithm of the ratio of the variance of map lengths to the assumed variance, at least 0.
+    #: Logarithm (at least 0) of the ratio of the variance of map lengths to the assumed variance.
     map_log_variance: float = 0.0
     #: Cumulative sum of contradictions between velocity and line (`kernels.tracking.monitors`).
     contradiction: float = 0.0
     #: One minus the recent mean weight of Dopplers and phases; 0 where a sensor measures the speed.
     motion_misfit: float = 0.0
-    step_s: float = 0.0  #: Time for which the codes together have implied a different position [s].
+    step_s: float = 0.0  #: Time for which the codes have implied another position than the estimate [s].
     level_hold_s: float = 0.0  #: Remaining time for which all protection levels are withheld [s].
-    #: Remaining time for which the protection level along the line is withheld [s], because other positions were more
-    #: probable than the risk.
+    #: Remaining time for which the protection level along the line is withheld [s], because the probability of other
+    #: positions exceeded the risk.
     ambiguity_hold_s: float = 0.0
     branch_s: float = 0.0  #: Time since the start of the hypotheses [s].
-    branch_m: float = 0.0  #: Distance since the start of the hypotheses [m].
-    distance_since_code_m: float = 0.0  #: Distance since the last used codes [m].
+    branch_m: float = 0.0  #: Distance travelled since the start of the hypotheses [m].
+    distance_since_code_m: float = 0.0  #: Distance travelled since codes were last used [m].
     direction: float = 0.0  #: Sign of the last speed with a known direction.
-    #: Bounds of the speed by earlier measured speeds (`railfix.kernels.tracking.model.narrow_speed_range`). With
-    #: several hypotheses, the speed is unbounded.
+    #: Bounds of the speed that follow from earlier speeds (`railfix.kernels.tracking.model.narrow_speed_range`). With
+    #: several hypotheses, the bounds are infinite.
     least_speed_mps: float = ANY_SPEED[0]
     most_speed_mps: float = ANY_SPEED[1]
     #: Time from `TrackState.origin` to the last epoch with used measurements; NaN before the first such epoch.
     measured_s: float = np.nan
-    #: Time from `TrackState.origin` to the last epoch with used codes; -inf if the next codes must be used.
+    #: Time from `TrackState.origin` to the last epoch with used codes; -inf to use the next codes at once.
     coded_s: float = -np.inf
 
 
@@ -72,8 +72,8 @@ MONITORS: Final = record_of(dict.fromkeys(Monitors.__dataclass_fields__, float) 
 HYPOTHESIS: Final = record_of({
     "log_probability": float,  # logarithm of the probability
     "log_code": float,  # part of `log_probability` due to codes (`railfix.kernels.tracking.hypotheses`)
-    "log_least": float,  # minimum of `log_probability`, which slowly rises with time (`constants.LEAST_RISE`)
-    # Recent code evidence between laps within the map error (`constants.RECENT_S`); not a probability.
+    "log_least": float,  # recent minimum of `log_probability`: the stored minimum rises slowly (`constants.LEAST_RISE`)
+    # Recent code evidence for one of several laps that the map cannot distinguish (`constants.RECENT_S`).
     "log_recent": float,
     "origin_m": float,  # arc length at the start of the hypothesis [m]
 })  # fmt: skip
