@@ -80,8 +80,8 @@ def test_the_end_of_an_outage_has_its_error_and_its_sigma() -> None:
     )
     run: Any = SimpleNamespace(name_in=lambda _, table: f"a ({table})")
     (text,) = _longest_outage(run, "front", SimpleNamespace(outages=outages))  # type: ignore[arg-type]
-    assert "(tunnel, 7.5 s, 80 m, positions by wheel)" in text
-    assert "at most 1.50 m; it is −0.25 m at the end, where the stated sigma is 12.5 m" in text
+    assert "without satellites: tunnel, 7.5 s, 80 m, positions by wheel. In it" in text
+    assert "at most 1.50 m; at its end, the error is −0.25 m, and the stated sigma is 12.5 m" in text
 
 
 @pytest.mark.parametrize(("excluded", "noted"), [(30, True), (11, False)])

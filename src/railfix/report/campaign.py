@@ -83,8 +83,8 @@ def report_campaign(runs: pl.DataFrame, out: Path) -> CampaignReport:
     named: list[Column] = [(field, field, str) for field in fields]
     columns: list[Column] = [*named, ("status", "status", str), *_FIGURES]
     caption = (
-        "Runs. Rate and ok refer to single epochs with observations; sigma, level and error refer to the filter along "
-        "the track, or to single epochs if the filter was off"
+        "All runs. The columns rate and ok refer to single epochs with observations; the columns of sigma, level and "
+        "error refer to the filter along the track, or to single epochs if the filter was off"
     )
     tables = [listing("runs", whole, columns, caption)]
     if len(failed := whole.filter(status="failed")):
@@ -112,7 +112,7 @@ def write_campaign_page(report: CampaignReport, path: Path, *, title: str) -> Pa
 def _epochs(folder: Path, reference: str | None) -> tuple[pl.DataFrame, tuple[str, ...]]:
     """Return the positions of the filter, or of single epochs if the filter was off, and a note.
 
-    The positions have errors if there is a usable reference. The note is present if the reference cannot be used.
+    The positions have errors if there is a usable reference. The note is given if the reference cannot be used.
 
     """
     name = next((table for table in list_position_tables(folder) if table != POSITIONS_TABLE), POSITIONS_TABLE)

@@ -227,7 +227,7 @@ class Figure:
     width: str  #: Name of the style class for the width: "wide" or "half".
     sky: str  #: Element id of the sky plot that shows the epoch of a clicked point; "" without a sky plot.
     zoomed_with: str  #: Figures with the same value share the range of the x axis; "" if the range is not shared.
-    linked: str  #: Figures with the same value show the same epochs after a zoom; "" if no figure is linked.
+    linked: str  #: After a zoom in one figure, figures with the same value show its epochs; "" if no figure is linked.
 
     @property
     def is_sky(self) -> bool:
@@ -311,9 +311,9 @@ def figure(
 ) -> Figure:
     """Return the figure of a chart with its values for the script of the page.
 
-    `numbers` yields the number of the figure. The times of the points are counted from the start of `group`; a click on
-    a point with a time shows the satellites in the sky plot `sky`. `anchor` is a prefix for the name of a shared x
-    axis. `linked` is as for `Figure`.
+    `numbers` yields the numbers of figures. The times of the points are counted from the start of `group`; a click on a
+    point with a time shows the satellites in the sky plot `sky`. `anchor` is a prefix of the name of the x axis that
+    figures share. `linked` is `Figure.linked`.
     """
     values: dict[str, Any]
     if isinstance(chart, SkyEpochs):
@@ -338,7 +338,7 @@ _LISTED: Final = 5_000
 def write_network_page(
     network: Network, quality: NetworkQuality, out: Path, *, run: tuple[PlanLog, Matched] | None = None
 ) -> None:
-    """Write the HTML page of a network with the findings of the map check, and the matched positions of a run if given.
+    """Write the HTML page of a network: findings of the map check and, if a run is given, its matched positions.
 
     The positions must be in the reference frame of the network. Raise OutputError if the file cannot be written.
     """

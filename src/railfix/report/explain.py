@@ -2,8 +2,8 @@
 
 Everything is read from the tables of the run. The effect of a satellite is the change of the single-epoch position if
 the satellite is omitted. This change is computed from the residuals by weighted least squares, linearised at the
-position. The unknowns are the shifts along, across and above the line and one clock per clock group; the map error is
-the prior of the shifts across and above the line (P1 2.2(3)).
+position. The unknowns are the shifts along, across and above the line and one clock per clock group; the map sigmas are
+the prior sigmas of the shifts across and above the line (P1 2.2(3)).
 """
 
 from __future__ import annotations
@@ -87,9 +87,9 @@ class Explanation:
     #: Row of the epoch in ``positions`` (`single`) and in ``train`` (`track`); `track` is empty if the filter was off.
     single: Mapping[str, Any]
     track: Mapping[str, Any]
-    #: One row per observation, used observations first, with elevation, residual, outcome, and weight and innovation in
+    #: One row per observation, used observations first: elevation, residual, outcome, and its weight and innovation in
     #: the filter. Columns `WITHOUT` describe the single-epoch position that results if a used observation is omitted:
-    #: its shift along the line and its standard deviation [m]; null if there is no such position.
+    #: the shift of this position along the line and its standard deviation [m]; null if there is no such position.
     satellites: pl.DataFrame
     sentences: tuple[str, ...]  #: Sentences on position, sigma, protection level and status.
     #: Epochs before and after the explained epoch: columns `_NEIGHBOURS` of ``positions``, and (with the prefix
@@ -158,7 +158,7 @@ def _nearest(times: Any, at: str) -> int:
 
 
 def _axes(folder: RunFolder, single: Mapping[str, Any]) -> Floats:
-    """Return the ECEF unit vectors along, across and above the nearest section of the line as rows, shape (3, 3)."""
+    """Return ECEF unit vectors along, across and above the nearest section, as rows of an array of shape (3, 3)."""
     line = Trajectory.from_antenna_path(read_run_track(folder))
     arc, _ = line.nearest(np.array([[single[name] for name in ("x_m", "y_m", "z_m")]]))
     along, across, _ = line.get_axes(line.segment_at(arc)[0])[0]
@@ -176,7 +176,7 @@ def _map_sigma_m(folder: RunFolder) -> tuple[float, float]:
 def _without_each(
     satellites: pl.DataFrame, single: Mapping[str, Any], axes: Floats, map_sigma_m: tuple[float, float]
 ) -> tuple[Floats, Floats]:
-    """Return the shift and the sigma of the position along the line [m] without each satellite, shape (rows,) each.
+    """Return shift and sigma along the line [m] of the position without each satellite, two arrays of shape (rows,).
 
     The values are NaN for unused satellites, and where the other satellites do not determine the position.
     """
@@ -231,9 +231,8 @@ def _sentences(single: Mapping[str, Any], track: Mapping[str, Any], satellites: 
     if single["along_sigma_m"] is not None and single["noise_scale"] is not None:
         own, whole = single["own_sigma_m"], single["along_sigma_m"]
         lines.append(
-            f"sigma: {own:.2f} m from the codes of this epoch alone, with an observed noise of "
-            f"{single['noise_scale']:.2f} times the assumed noise; "
-            f"{whole:.2f} m with satellite, atmospheric and map errors and other possible positions"
+            f"sigma: {own:.2f} m from code noise alone (observed noise: {single['noise_scale']:.2f} times the assumed "
+            f"noise); {whole:.2f} m if satellite, atmospheric and map errors and other possible positions are included"
         )
     if "protection_level_m" in single:
         lines.append(f"single epoch's level: {_level_of_single(single)}")
@@ -266,11 +265,11 @@ def _level_of_filter(track: Mapping[str, Any]) -> str:
         return "none"
     parts = f"{noise:.1f} m covers noise"
     if apart is not None:
-        parts += f"; omitting any one source moves the result by at most {apart:.1f} m"
+        parts += f"; omitting any one source moves the position by at most {apart:.1f} m"
     if level is None or not np.isfinite(level):
         ground = track["protection_level_ground_m"]
         held = "" if ground is None or not np.isfinite(ground) else f"; on the ground {ground:.1f} m"
-        return f"none along the line{held} ({parts})"
+        return f"no finite level along the line{held} ({parts})"
     return f"{level:.1f} m: {parts}"
 
 
@@ -305,8 +304,8 @@ def write_explanation(explanation: Explanation, path: Path) -> Path:
 
 
 def _label_points(sky: Sequence[Mapping[str, Any]]) -> list[tuple[float, float]]:
-    """Return the start of each satellite's label in a sky plot, chosen so that the label covers the fewest points and
-    labels.
+    """Return the start position of each satellite's label in a sky plot, at which the label covers the fewest points
+    and labels.
     """
     wide, taken, labels = 9.5, [(point["x"] - 2.4, point["y"] + 1.8, 4.8) for point in sky], []
     for point in sky:

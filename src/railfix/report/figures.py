@@ -1,4 +1,4 @@
-"""Charts of a run in the order of the page, reasons for missing charts, and tables of the protection levels."""
+"""Charts of a run, ordered as on the page, reasons for missing charts, and tables of the protection levels."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ from railfix.report.runs import ReportedRun
 WORST: Final = 20
 NO_LEVELS: Final = "The run has no protection levels (protection is off)."
 _KINDS: Final = {
-    "sbas": "satellite faults are covered by SBAS; hypotheses of local faults (multipath)",
-    "separation": "solution separation; hypotheses of satellite and local faults",
+    "sbas": "SBAS covers satellite faults; fault hypotheses: local faults (multipath)",
+    "separation": "solution separation; fault hypotheses: satellite faults and local faults",
 }
 _EXPLAINED: Final = (
-    "In rows of usable levels, a position with another status than ok or with an alarm counts as having an infinite "
-    "level. In rows of all levels, every finite level is counted, whatever the status"
+    "In rows of usable levels, the level counts as infinite if the status of the position is not ok or an alarm is "
+    "active. In rows of all levels, every finite level is counted, whatever the status"
 )
 
 
@@ -83,7 +83,7 @@ def _assumptions(run: ReportedRun, kind: str) -> Table:
 
 
 def _priors(priors: Any) -> str:
-    """Return priors by constellation as text: each distinct value, followed by the constellations that have it."""
+    """Return fault priors as text: each distinct value, followed by the constellations to which it applies."""
     if not isinstance(priors, Mapping):
         return "not recorded"
     alike: dict[str, list[str]] = {}
@@ -104,8 +104,8 @@ def _availability(run: ReportedRun) -> Table:
         name="availability",
         head=["antenna", "levels", "limit, m", "epochs", "finite", "p50", "p95", "available", "15 s", "60 s"],
         rows=list(_rows_available(run, limits, options)),
-        caption="Fraction of all epochs that have an available level; and, of the windows of 15 s and 60 s that begin "
-        f"at such an epoch, the fraction in which the level stays available. {_EXPLAINED}. Levels are in metres; "
+        caption="Fraction of all epochs that have an available level. Of the windows of 15 s and 60 s that begin with "
+        f"an available level, fraction in which the level stays available. {_EXPLAINED}. Levels are in metres; "
         "without a reference they are not compared with errors",
         numeric=range(2, 10),
     )
@@ -132,11 +132,11 @@ def _rows_available(run: ReportedRun, limits: Sequence[float], options: Evaluati
                 ]
 
 
-#: The sky plot includes this number of epochs with the largest errors, for each kind of position.
+#: For each kind of position, the sky plot includes this number of epochs with the largest errors.
 _WORST: Final = 200
 NO_REFERENCE: Final = (
     "No reference was given (--reference), so there are no errors, figures of merit or Stanford diagrams. "
-    "Intervals are computed between consecutive positions."
+    "Distances travelled are computed between consecutive positions."
 )
 NO_OBSERVATIONS: Final = (
     "The run wrote no observations (railfix run --observations), so there are no charts of the sky, of C/N0 and of "
@@ -258,7 +258,7 @@ def _keep(*charts: Chart) -> tuple[Chart, ...]:
 
 
 def _stanford(run: ReportedRun, antenna: str, errors: pl.DataFrame, limit_m: float) -> Iterator[Chart]:
-    """Yield Stanford diagrams of the usable levels, of all levels, and of the filter's usable levels."""
+    """Yield Stanford diagrams: usable and all levels of single epochs, and usable levels of the filter."""
     kind, filtered, options = run.folder.level_kind, run.filter_rows(antenna), EvaluationOptions()
     if kind is None:
         return
@@ -271,7 +271,7 @@ def _stanford(run: ReportedRun, antenna: str, errors: pl.DataFrame, limit_m: flo
 
 
 def _align(positions: pl.DataFrame, errors: pl.DataFrame) -> Floats:
-    """Return the error of each position, shape (rows,) [m]; NaN for a position without an error in the table."""
+    """Return the error of each position, shape (rows,) [m]; NaN if the table has no error of a position."""
     known = errors.select("time_gpst", error_m=pl.Series(good_errors(errors, "error_m"), nan_to_null=True))
     joined = positions.select("time_gpst").join(known, on="time_gpst", how="left", maintain_order="left")
     return floats(joined, "error_m")

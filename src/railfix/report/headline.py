@@ -34,7 +34,7 @@ class Headline:
 
     verdict: str  #: Sentences on availability and accuracy.
     figures: tuple[KeyFigure, ...]
-    compared: str  #: Definitions of the kinds of position that the figures compare.
+    compared: str  #: Sentences that define the kinds of position that the figures compare.
     remarks: tuple[str, ...]  #: Sentences on the longest outage, large errors, and failed checks.
 
 
@@ -45,7 +45,7 @@ def headline(run: ReportedRun, antenna: str, evaluation: Evaluation | None) -> H
         filtered = get_figures(evaluation, run, antenna, "constrained", table="train")
         if passed.get("errors") or filtered.get("errors"):
             return _with_errors(run, antenna, evaluation, passed)
-    unknown = "--reference" if evaluation is None else "no position that passed every check has a reference"
+    unknown = "--reference" if evaluation is None else "no reference at the times of positions that passed every check"
     return _without_errors(run, antenna, f"Errors are not known without a reference ({unknown}).")
 
 
@@ -53,12 +53,12 @@ def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, passed:
     """Return the headline with errors; `passed` has the figures of the single epochs that passed every check."""
     other = get_figures(evaluation, run, antenna, "conventional")
     filtered = get_figures(evaluation, run, antenna, "constrained", table="train")
-    whose = "Single epochs have" if filtered else "The train has"
+    whose = "there is" if filtered else "the train has"
     passing = "No single-epoch position with a reference passed every check."
     if passed.get("errors"):
         passing = (
-            f"{whose} a position on the line that passed every check in {share(passed['rate'], 1)} of the epochs with "
-            f"satellite signals; 95 % of the errors of these positions are below {number(passed['p95_m'], 1)} m, and "
+            f"In {share(passed['rate'], 1)} of the epochs with satellite signals, {whose} a position on the line that "
+            f"passed every check; 95 % of the errors of these positions are below {number(passed['p95_m'], 1)} m, and "
             f"the largest is {number(passed['max_m'], 1)} m (conventional positions: {number(other.get('p95_m'), 1)} m "
             f"and {number(other.get('max_m'), 1)} m)."
         )
@@ -83,9 +83,9 @@ def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, passed:
     ]  # fmt: skip
     ranges = "unscreened ranges, as in paper P1" if run.conventional is not None else "the same screened ranges"
     large = (
-        "The large figures refer to the filter along the track at all epochs. Figures of single epochs"
+        "The figures in large type refer to the filter along the track at all epochs. Figures of single epochs"
         if filtered
-        else "The large figures"
+        else "The figures in large type"
     )
     stated = _verdict_figures(run, antenna)
     level = list(stated.values())[-1]
@@ -108,7 +108,7 @@ def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, passed:
 
 
 def _verdict_figures(run: ReportedRun, antenna: str) -> dict[str, KeyFigure]:
-    """Return an antenna's key figures from the verdict on the run, by name; empty if ``run.json`` has none."""
+    """Return an antenna's key figures by name, from the verdict in ``run.json``; empty if there is no verdict."""
     found = next((each for each in judge_run(run.record).antennas if each.antenna == antenna), None)
     if found is None:
         return {}
@@ -119,7 +119,7 @@ def _verdict_figures(run: ReportedRun, antenna: str) -> dict[str, KeyFigure]:
 
 
 def _count_beyond(run: ReportedRun, antenna: str, evaluation: Evaluation, passed: Mapping[str, Any]) -> str:
-    """Return a text with the number of errors above usable levels, or the normalised error if there are no levels."""
+    """Return a text: number of errors above usable levels, or, if there are no levels, the normalised error."""
     kinds = {run.folder.level_kind or "": run.name_in(evaluation), "train": run.name_in(evaluation, "train")}
     counts = [
         f"{'filter' if kind == 'train' else 'single epochs'} {len(found):,}"
@@ -147,16 +147,16 @@ def _longest_outage(run: ReportedRun, antenna: str, evaluation: Evaluation) -> I
         passed = evaluation.outages.filter(run=run.name_in(evaluation, "train"), antenna=antenna)
         for row in passed.sort("travelled_m", descending=True, nulls_last=True).head(1).iter_rows(named=True):
             yield (
-                f"In the longest of {len(passed)} stretches without satellites ({row['environment']}, "
+                f"The longest of {len(passed)} stretches without satellites: {row['environment']}, "
                 f"{number(row['duration_s'], 1)} s, {number(row['travelled_m'], 0)} m, positions by "
-                f"{row['carried_by'].replace('+', ' and ') or 'dead reckoning'}), the error is at most "
-                f"{number(row['outage_max_m'], 2)} m; it is {number(row['end_error_m'], 2)} m at the end, where the "
-                f"stated sigma is {number(row['end_sigma_m'], 1)} m."
+                f"{row['carried_by'].replace('+', ' and ') or 'dead reckoning'}. In it, the error is at most "
+                f"{number(row['outage_max_m'], 2)} m; at its end, the error is {number(row['end_error_m'], 2)} m, and "
+                f"the stated sigma is {number(row['end_sigma_m'], 1)} m."
             )
 
 
 def _larger_error(passed: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
-    """Return a sentence if the largest error on the map exceeds the largest error of conventional positions."""
+    """Return a sentence that the largest error on the map exceeds that of conventional positions; none otherwise."""
     if not other.get("errors") or not passed.get("errors") or passed["max_m"] <= other["max_m"]:
         return []
     return [
@@ -178,7 +178,7 @@ def _describe_marked(errors: pl.DataFrame | None) -> list[str]:
     return [
         f"{len(marked):,} further positions failed a check (status: {statuses}); their "
         "largest "
-        f"error is {largest}. They are drawn, but not included in the figures above."
+        f"error is {largest}. The charts show them, but the figures above do not include them."
     ]
 
 

@@ -37,7 +37,7 @@ from railfix.report.plots.signals import SKY_EPOCHS
 from railfix.report.runs import ReportedRun, get_figures, read_runs
 from railfix.run.record import budget_tables, level_basis
 
-#: Errors in the table of all runs: kind of position and table of positions, by name in the header.
+#: Errors in the table of all runs: for each name in the header, kind of position and table of positions.
 _JUDGED: Final = {
     "filter": ("constrained", "train"),
     "single epochs": ("constrained_ok", POSITIONS_TABLE),
@@ -70,14 +70,14 @@ def summary(runs: Sequence[ReportedRun], evaluation: Evaluation | None) -> Table
                     row += [number(figures.get(k)) for k in ("p95_m", "max_m")]
             rows.append(row)
     caption = (
-        "The column of settings has the preset and the settings that differ from it. The rate is the number of "
+        "The column of settings has the preset, and settings whose values differ from it. The rate is the number of "
         "positions divided by the number of epochs with observations. Sigma p95 is the 95th percentile of the stated "
         "standard deviation along the line, in metres"
     )
     if evaluation:
         caption += (
-            ". The last columns are the 95th percentile and the largest of the errors along the line, in metres, of "
-            "the filter at all epochs, of single epochs that passed every check, and of conventional positions"
+            ". The last columns are the 95th percentile and the maximum of the error along the line, in metres: for "
+            "the filter at all epochs, for single epochs that passed every check, and for conventional positions"
         )
     columns = range(3, len(head) + len(judged))
     return Table(name="summary", head=[*head, *judged], rows=rows, caption=caption, numeric=columns)
@@ -105,7 +105,7 @@ def provenance(run: ReportedRun) -> list[Block]:
         ("epochs", "; ".join(spans)),
         ("reference", run.reference or "none given"),
         ("line", f"{run.folder.line_name}, {track.get('length_m', '?')} m, {track.get('points', '?')} points"),
-        ("vehicle", str(vehicle.get("name") or "none; the track is the trajectory of the antenna")),
+        ("vehicle", str(vehicle.get("name") or "none: the track is taken as the trajectory of the antenna")),
         ("versions", ", ".join(f"{name} {value}" for name, value in versions.items())),
         ("platform", str(record.get("platform", "not recorded"))),
         ("wall time", f"{record.get('wall_s', '?')} s"),
@@ -137,7 +137,7 @@ def settings(run: ReportedRun) -> list[Block]:
 
 
 def budget(run: ReportedRun) -> list[Block]:
-    """Return tables of signs of interference, epochs by status, and pseudoranges by first rejection reason."""
+    """Return three tables: signs of interference, epochs by status, and pseudoranges by first reason of rejection."""
     antennas = _antennas(run)
     signs = [
         [name, sign, count(seen["epochs"]), str(seen["first"])]
@@ -203,8 +203,8 @@ def write_report(
 ) -> Path:
     """Write the report on runs as an HTML page and return its path; a failed write leaves an existing file unchanged.
 
-    For `references`, `conventional` and the raised errors see `railfix.report.read_runs`. `background` is a GeoJSON
-    file with lines that are drawn below the plan. Raise OutputError if the page cannot be written.
+    For `references`, `conventional` and the errors that are raised, see `railfix.report.read_runs`. `background` is a
+    GeoJSON file with lines that are drawn below the plan. Raise OutputError if the page cannot be written.
     """
     folders, others, unscreened = (
         [Path(name) for name in path_names(names)] if names else [] for names in (runs, references, conventional)

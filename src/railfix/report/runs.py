@@ -112,10 +112,10 @@ def read_runs(
 ) -> tuple[tuple[ReportedRun, ...], Evaluation | None]:
     """Read runs, and evaluate them if there are references; without references the evaluation is None.
 
-    `references` is empty, or has one reference for all runs or one for each run in order. `conventional` is empty, or
-    names another run on the same log for each run in order; the conventional positions of the other run are shown. A
-    run with only the elevation and C/N0 screens provides the unscreened positions of paper P1. The table of epochs in
-    the evaluation is empty; the report takes the values of the epochs from the returned runs instead.
+    `references` is empty, or has one reference for all runs, or one for each run in order. `conventional` is empty, or
+    has, for each run in order, another run on the same log whose conventional positions are shown instead; for the
+    unscreened positions of paper P1, a run with only the elevation and C/N0 screens. The table of epochs in the
+    evaluation is empty; the report takes the values of the epochs from the returned runs instead.
 
     Raise InputFileError if a file is missing or malformed. Raise MismatchError if a reference does not match the run.
     Raise SettingsError if there is no run, the number of references or conventional runs is wrong, or a run is given

@@ -89,10 +89,10 @@ def processing_time(chunks: Mapping[str, Sequence[Any]]) -> Chart:
     return Chart(
         name="processing-time",
         title="Time per epoch",
-        caption=f"Mean in each of {len(x):,} chunks of up to {epochs.max(initial=0):,.0f} epochs of all antennas, "
-        f"drawn at the first epoch, without reading and writing of files. The mean over the run is {whole:.3f} ms "
-        "per epoch and antenna. A chunk is processed as a whole; live operation, which processes each epoch "
-        "separately, takes longer per epoch.",
+        caption=f"Each value is the mean over one of {len(x):,} chunks of up to {epochs.max(initial=0):,.0f} epochs of "
+        "all antennas, drawn at the first epoch of the chunk. The time for reading and writing files is not included. "
+        f"The mean over the run is {whole:.3f} ms per epoch and antenna. A chunk is processed as a whole; live "
+        "operation, which processes each epoch separately, takes longer per epoch.",
         x_label="GPS time",
         y_label="ms per epoch",
         layers=(

@@ -247,7 +247,8 @@ _GOLDEN: Final = (5**0.5 - 1.0) / 2.0
 
 
 def extremes(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
-    """Return the ascending indices of the smallest and largest `y` in each of `points` / 2 equal pieces of the x range.
+    """Return the ascending indices of all points that have the smallest or largest `y` in one of `points` / 2 equal
+    pieces of the x range.
 
     Points with NaN are omitted. If at most `points` points are left, the indices of all of them are returned.
     """
@@ -271,8 +272,8 @@ def extremes(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
 def one_per_cell(x: Floats, y: Floats, *, cell: float, points: int = POINTS) -> Indices:
     """Return the indices of at most one point per square cell; if there are few points, return all indices.
 
-    Points with NaN are omitted. If more than `points` points are left, the cells have the width `cell`, which is
-    increased until at most `points` points are selected. Otherwise all points are selected.
+    Points with NaN are omitted. If more than `points` points are left, one per cell is selected; the width of the cells
+    is first `cell`, and is increased until at most `points` points are selected. Otherwise all points are selected.
     """
     rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     left, low = (float(v[rows].min()) if len(rows) else 0.0 for v in (x, y))
@@ -288,14 +289,14 @@ def one_per_cell(x: Floats, y: Floats, *, cell: float, points: int = POINTS) -> 
 def spread(x: Floats, y: Floats, *, points: int = POINTS) -> Indices:
     """Return the indices of at most `points` points that represent a series.
 
-    Points with NaN are omitted. If at most `points` points are left, all are selected. Otherwise a fifth of the
-    selected points are `extremes`, and a golden-ratio sequence selects the other points evenly.
+    Points with NaN are omitted. If at most `points` points are left, all are selected. Otherwise `extremes` selects a
+    fifth of the points, and a golden-ratio sequence spreads the rest evenly over the series.
     """
     rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
     if len(rows) <= points:
         return rows
     outline = extremes(x, y, points=points // 5)
-    # the low-discrepancy sequence is uniform in [0, 1), so that a threshold selects evenly distributed rows
+    # the low-discrepancy sequence is uniform in [0, 1), so that rows below a threshold are evenly distributed
     order = (np.arange(len(rows)) * _GOLDEN) % 1.0
     sample = rows[order < (points - len(outline)) / len(rows)]
     return np.asarray(np.union1d(outline, sample)[:points], dtype=np.intp)

@@ -54,7 +54,7 @@ def plotter(chart_of: Callable[P, Chart]) -> Callable[..., Axes]:
     @wraps(chart_of)
     def draw(*args: Any, ax: Axes | None = None, **kwargs: Any) -> Axes:
         if of_table and args and not isinstance(args[0], pl.DataFrame):
-            hint = "positions_table and train_table of a result, and evaluations, have rows to filter by antenna"
+            hint = "give positions_table or train_table of a result, or an evaluation, with the rows of one antenna"
             raise SettingsError(f"{draw.__name__}: expected a polars table, got {type(args[0]).__name__}; {hint}")
         try:
             chart = chart_of(*args, **kwargs)

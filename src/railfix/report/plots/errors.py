@@ -118,7 +118,7 @@ def _errors(errors: pl.DataFrame, filtered: pl.DataFrame | None, start: np.datet
     if scale["y_scale"] == "symlog":
         caption.append(f"The scale is logarithmic beyond ± {scale['y_linear']:g} m.")
     if levels and np.isfinite(every).any():
-        # a few large levels would make the errors too small to read: the axis shows the errors and the median level
+        # a few large levels would make the errors too small to read; the axis ends above errors and median level
         top = 1.25 * max(float(np.nanmax(np.abs(every))), *(float(np.nanmedian(most)) for most in levels))
         scale["y_range"] = (-top, top)
         if max(float(np.nanmax(most)) for most in levels) > top:
@@ -137,7 +137,7 @@ def _errors(errors: pl.DataFrame, filtered: pl.DataFrame | None, start: np.datet
 
 
 def good_errors(errors: pl.DataFrame, column: str) -> Floats:
-    """Return the errors in a column [m]; NaN where ``reference_good`` is false, if the table has this column."""
+    """Return the errors in a column [m]; NaN where the column ``reference_good``, if there is one, is false."""
     values = floats(errors, column)
     return np.where(errors["reference_good"].to_numpy(), values, np.nan) if "reference_good" in errors else values
 
@@ -164,7 +164,7 @@ def _greatest(x: Floats, y: Floats) -> tuple[Floats, Floats]:
     most = np.full(_PIECES, np.nan)
     np.fmax.at(most, piece, y[rows])
     here = np.isfinite(most)
-    # single empty pieces are not gaps: they are due to the spacing of the epochs
+    # isolated empty pieces are not gaps: they are due to the spacing of the epochs
     inside = np.flatnonzero(here)
     spacing = np.percentile(np.diff(inside), 98) if len(inside) > 1 else 1.0
     gap = np.flatnonzero(np.diff(inside) > 3 * spacing)
@@ -276,7 +276,7 @@ def stanford(diagram: Stanford, *, title: str = "Stanford diagram") -> Chart:
         title=title,
         caption=f"{judged:,} epochs have an error: {regions}. Levels are available at "
         f"{100 * diagram.available_rate:.2f} % of all epochs"
-        f"{'; of the windows beginning at such an epoch, the level stays available in: ' + kept if kept else ''}. "
+        f"{'; windows that begin with an available level and keep it: ' + kept if kept else ''}. "
         f"Right of the diagonal the error exceeds the level. Values above {top:g} m, including infinite levels, are "
         "counted in the last cells. Darker cells have more epochs, on a logarithmic scale.",
         x_label="absolute error along the line [m]",
@@ -346,8 +346,8 @@ def _levels(positions: pl.DataFrame, alarm_limit_m: float, start: np.datetime64 
     caption[1] += f"; not drawn: {plural(infinite, 'infinite level')}." if infinite else "."
     if any(label in {layer.label for layer in layers} for label, _ in _PARTS[:3]):
         caption.append(
-            "Each part is computed with a fraction of the risk; the level uses the whole risk, and can be smaller than "
-            "a part."
+            "Each part is the level that its fraction of the risk requires; the level itself uses the whole risk, and "
+            "can therefore be smaller than a part."
         )
     return Chart(
         name="levels-chainage" if start is None else "levels",

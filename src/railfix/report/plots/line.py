@@ -63,9 +63,9 @@ def plan(
 ) -> Chart:
     """Return a plan of the line and the positions of one antenna, with marks of the kilometrage (P1 figure 6).
 
-    Positions are coloured by `error_m`, by `level_m`, both of shape (rows,), or by status: by the first of these that
-    is given. With `filtered`, the positions of the filter are drawn at epochs without a single-epoch position. Without
-    `track`, the line is drawn through the positions. `tunnels_m` has the first and last chainage of each tunnel.
+    Positions are coloured by the first of these that is given: `error_m`, shape (rows,), `level_m`, shape (rows,),
+    status. If `filtered` is given, filter positions are drawn at epochs without a single-epoch position. If `track` is
+    not given, the line is drawn through the positions. `tunnels_m` has the first and last chainage of each tunnel.
     `background` has lines that are drawn below, each as longitude and latitude of shape (P, 2) [deg]. The chart is
     empty if there is no position.
     """
@@ -128,7 +128,7 @@ class LocalFrame:
     """Local frame with axes east, north and up at a point."""
 
     origin_ecef_m: Floats  #: Shape (3,).
-    axes: Floats  #: Unit vectors east, north and up in ECEF as rows, shape (3, 3).
+    axes: Floats  #: ECEF unit vectors: rows east, north and up, shape (3, 3).
     latitude_deg: float
     longitude_deg: float
     height_m: float
@@ -212,7 +212,7 @@ def _classes(
 
 
 def size_classes(size: Floats, edges: Sequence[float], quantity: str, unknown: str) -> list[tuple[str, str, Masks]]:
-    """Return label, colour and mask of the class of NaN values, and of each class of values between `edges` [m]."""
+    """Return label, colour and mask of each class: first NaN values, then values between consecutive `edges` [m]."""
     classes = [(unknown, BLACK, np.isnan(size))]
     for low, high, colour in zip((0.0, *edges), (*edges, np.inf), ORDERED, strict=True):
         label = f"{quantity} {low:g} to {high:g} m" if np.isfinite(high) else f"{quantity} {low:g} m and more"
@@ -252,9 +252,8 @@ def _kilometrage(positions: pl.DataFrame, here: Floats) -> Marks:
 def interval(table: pl.DataFrame, prefix: str = "") -> tuple[Floats, Floats]:
     """Return the chainage of positions and the distance from the previous position [m].
 
-    `prefix` is the beginning of the column names. Distances are taken from the column of intervals, and positions at
-    standstill are left out. Without this column, distances are differences of chainage, and include positions at
-    standstill.
+    `prefix` is the beginning of the column names. If the table has a column of intervals, distances are taken from it,
+    without positions at standstill. Otherwise distances are differences of chainage, including positions at standstill.
     """
     if f"{prefix}interval_m" in table.columns:
         chainage, distance = floats(table, "chainage_m"), floats(table, f"{prefix}interval_m")
@@ -315,7 +314,7 @@ def interval_distribution(table: pl.DataFrame) -> Chart:
 
 def _by(table: pl.DataFrame) -> str:
     if "interval_m" in table.columns:
-        return "The reference gives the distance travelled; intervals at standstill are omitted."
+        return "Distances between positions are measured along the reference; positions at standstill are omitted."
     return "Without a reference, the distances are computed from the positions and include their noise."
 
 

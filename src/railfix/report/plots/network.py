@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 _DRAWN: Final = 200_000
 #: Maximum number of tracks that are named in the plan.
 _NAMED: Final = 400
-#: Margin of the view around a run, as a fraction of the larger extent of the run; minimum margin [m]; distance of a
-#: track name from the track, as a fraction of the extent of the view.
+#: Margin of the view around a run, relative to the run's larger extent; minimum margin [m]; distance of a track's name
+#: from the track, relative to the extent of the view.
 _MARGIN, _LEAST_VIEW_M, _BESIDE = 0.12, 100.0, 0.03
 _KINDS: Final = {"gap": RED, "joint": RED, "kink": "#e08e0b", "too near": "#7b3294", "dead end": GREY}
 #: Classes of matched positions: lower limit of the track probability, and colour.
@@ -121,7 +121,7 @@ def _names_beside(
     points, ahead, _ = network.course_on(track, matched.chainage_m[rows])
     (x, y), (dx, dy) = frame.plane(points).T, (ahead @ frame.axes[:2].T).T
     span = max(high - low for low, high in view)
-    # a name is wider than high, and is therefore placed farther from a track in north-south direction
+    # a name is wider than high, and is therefore placed farther away from tracks that run north-south
     away = np.where(np.arange(len(rows)) % 2, -1.0, 1.0) * span * (_BESIDE * np.abs(dx) + 2.0 * _BESIDE * np.abs(dy))
     words = tuple(network.names[t] for t in track)
     return Marks(label="names", colour=BLACK, x=x + away * dy, y=y - away * dx, words=words, place="on")
@@ -130,7 +130,7 @@ def _names_beside(
 def _thin(network: Network, nth: int) -> tuple[Indices, Indices]:
     """Return the indices of every n-th point and the last point of each track.
 
-    The second array has the positions in the first array at which the second and each further track begins.
+    Also return the indices in this array at which all tracks but the first begin.
     """
     first, last = network.first_point[:-1], network.first_point[1:] - 1
     track = np.repeat(np.arange(len(first)), last - first + 1)
@@ -140,13 +140,13 @@ def _thin(network: Network, nth: int) -> tuple[Indices, Indices]:
 
 
 def _switches(network: Network) -> Indices:
-    """Return the track and the end of the stem of each switch, shape (n, 2)."""
+    """For each switch, return its stem: index of the track and of the track's end, shape (n, 2)."""
     stems = sorted(end for end, others in network.passages.items() if len(others) > 1)
     return np.array(stems, dtype=np.intp).reshape(-1, 2)
 
 
 def _positions(frame: LocalFrame, log: PlanLog, matched: Matched) -> list[Layer]:
-    """Return layers of the positions by class of track probability, and of the positions without a track."""
+    """Return one layer of positions for each class of track probability, and one for positions without a track."""
     east, north = frame.to_plane(log.latitude_deg, log.longitude_deg).T
     on, layers, above = matched.track >= 0, [], np.inf
     for low, colour in _CLASSES:
@@ -248,7 +248,7 @@ def _draw_panels(panels: dict[str, Axes], quality: TrackQuality) -> None:
 
 
 def plot_survey(surveyed: Surveyed, path: str | PathLike[str]) -> None:
-    """Write a picture of a survey: a plan of positions and map, and the height and standard deviations over chainage.
+    """Write a picture of a survey: a plan of positions and map, and charts of height and standard deviations.
 
     Raise OutputError if the file cannot be written.
     """
@@ -295,7 +295,7 @@ def plot_survey(surveyed: Surveyed, path: str | PathLike[str]) -> None:
 
 
 def plot_track_decision(decision: TrackDecision, path: str | PathLike[str], *, risk: float) -> None:
-    """Write a picture of the probability of each track, and of its complement with the allowed risk, over time."""
+    """Write a picture over time: probability of each track, and, with the allowed risk, the complement to 1."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 6), dpi=120)

@@ -205,7 +205,7 @@ class _ScreenRows:
         return self.observations.select(values).collect()[column].to_numpy()[:, None]
 
     def rejected(self, reason: Reason) -> Masks:
-        """Return whether each observation has a rejection reason, shape (N, 1)."""
+        """Return True for observations that have a rejection reason, shape (N, 1)."""
         flags = self.observations.select((pl.col("reason") & int(reason)) != 0).collect()
         return flags["reason"].to_numpy()[:, None]
 
@@ -217,9 +217,8 @@ class _ScreenRows:
 def draw_run_screens(run: Path, out: Path) -> list[Path]:
     """Write one picture per screen and antenna, such as ``front_doppler.png``, into the folder `out`; return the paths.
 
-    No picture is written for a screen that tested no value. Raise InputFileError if `run` is not a results folder, or
-    the run wrote no observations (``railfix run --observations``). Raise OutputError if the folder or a file cannot be
-    written.
+    A screen that tested no values has no picture. Raise InputFileError if `run` is not a results folder, or the run
+    wrote no observations (``railfix run --observations``). Raise OutputError if the folder or a file cannot be written.
     """
     (reported,), _ = read_runs([run])
     if reported.observations is None:

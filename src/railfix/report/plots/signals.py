@@ -163,7 +163,7 @@ def sky_epochs(
 ) -> SkyEpochs:
     """Return the satellites in view of one antenna at some epochs, for sky plots.
 
-    At most `epochs` epochs are returned: up to half of them are `wanted` epochs, and the others are evenly spaced. Each
+    At most `epochs` epochs are returned: up to half of them are from `wanted`, and the rest are evenly spaced. Each
     satellite has one row per epoch, with the signal that was selected for positioning.
     """
     rows = observations.lazy().filter(pl.col("elevation_deg") >= 0.0, pl.col("azimuth_deg").is_not_null())
