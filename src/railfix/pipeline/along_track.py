@@ -34,7 +34,7 @@ from railfix.tracking import GnssEpochs, Line, RangeEpochs, SensorEpochs, Tracke
 from railfix.tracking.levels import track_with_levels
 from railfix.tracking.result import is_bounded
 
-#: Rejection reasons that the filter ignores, because it weights multipath and faults over several epochs itself.
+#: Rejection reasons that the filter ignores, because it reduces the weights of multipath and faults itself.
 _WEIGHED_BY_FILTER: Final = (
     Reason.FAULT_EXCLUDED
     | Reason.ALONE_ON_ITS_CLOCK
@@ -47,15 +47,15 @@ _WEIGHED_BY_FILTER: Final = (
 _CODE_ALONE: Final = Reason.GROSS_ERROR
 #: The train is at standstill if the speed plus two sigmas is below this [m/s]: 1 km/h, the lower limit of tachometers.
 STANDSTILL_MPS: Final = 1.0 / 3.6
-#: Number of sigmas up to which positions beyond an end of the line are moved to the end.
+#: Positions beyond an end of the line by at most this number of sigmas are moved to the end.
 _END_SIGMAS: Final = 4.0
-#: Distance up to which positions beyond an end are moved to the end even if the sigma is smaller [m].
+#: Positions beyond an end by at most this distance are moved to the end, whatever the sigma [m].
 _END_M: Final = 30.0
 #: Half-width of the gate of two-way ranges around the predicted range, in standard deviations.
 _GATE_SIGMAS: Final = 3.0
-#: Minimum half-width of the gate towards long ranges [m]. Echoes over 0.3 m longer are separable (P2, table 3).
+#: Minimum half-width of the gate towards long ranges [m]. Echoes delayed by over 0.3 m can be separated (P2, table 3).
 _LATE_M: Final = 0.6
-#: Vertical error of the ionospheric model for which the filter's displacements (`slow_code_m`, `TILT_M`) are valid [m].
+#: Vertical error of the ionospheric model that the filter's constants `slow_code_m` and `TILT_M` assume [m].
 _QUIET_IONOSPHERE_M: Final = 1.0
 #: Length of the blocks of GPS time that the filter processes if there are sensors [ns].
 _BLOCK_NS: Final = 5_000_000_000

@@ -125,15 +125,15 @@ class PassingState:
 
     time: Datetimes  #: Time of the last epoch with a position; shape (1,), or (0,) without an epoch.
     values: Floats  #: `_VALUES` of the last epoch with a position; shape (1, 5) or (0, 5).
-    #: Last known side of each balise on which the train was: -1 before the balise, 1 beyond it, 0 unknown; shape (M,).
+    #: Side of each balise on which the train was last known to be: -1 before it, 1 beyond it, 0 unknown; shape (M,).
     side: Integers
-    since: Datetimes  #: Time at which the train left `side`, shape (M,).
+    since: Datetimes  #: Time at which the train left the side given in `side`, shape (M,).
     over: Datetimes  #: Time at which the filter's position was last over the balise, shape (M,).
     over_values: Floats  #: `_VALUES` at the time `over`, and odometer accuracy; shape (M, 6).
     read: Datetimes  #: Time of the last correct reading of each balise, shape (M,).
     #: Readings after the last epoch, which are compared with the filter's positions in the next chunk.
     waiting: BaliseReadings = field(default_factory=BaliseReadings)
-    #: Time and filter position [m] of each correct reading, starting with the last reading older than `_APART_S`.
+    #: Time and filter position [m] of the correct readings of the last `_APART_S`, and of the last one before these.
     right: tuple[tuple[np.datetime64, float], ...] = ()
 
     @classmethod
@@ -186,7 +186,7 @@ def _judge(
     state: PassingState,
     limits: BaliseLimits,
 ) -> tuple[PassingState, list[Passing]]:
-    """Return the state with the correct readings added, and the wrong readings."""
+    """Add the correct readings to the state; return the state and the wrong readings."""
     wrong: list[Passing] = []
     read, right = state.read.copy(), list(state.right)
     heard = readings.time <= time[-1]
@@ -246,7 +246,7 @@ def _pass(
             continue
 
         def instant(first: float, last: float, k: int = int(row)) -> np.datetime64:
-            """Return the time between two epochs at which a value is zero; the time of the earlier one if unknown."""
+            """Return when a value crosses zero between two epochs; the time of the earlier epoch if this is unknown."""
             span = float(seconds(time[k] - time[k - 1]))
             known = np.isfinite(first - last) and first != last and span <= _APART_S
             return np.datetime64(time[k - 1] + timedelta(span * first / (first - last) if known else 0.0))

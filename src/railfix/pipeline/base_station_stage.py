@@ -36,8 +36,8 @@ _SAME_PLACE_M: Final = 0.01
 
 
 class Stations(NamedTuple):
-    """Surveyed positions of ground units, base station and balises, and the feature search of each antenna. If the base
-    station is "stream", its position is read from the headers of its observations.
+    """Surveyed positions of ground units, base station and balises; also the feature search of each antenna. If the
+    base station is "stream", its position is read from the headers of its observations.
     """
 
     units: GroundUnits | None = None
@@ -152,7 +152,7 @@ class BaseStation:
 
 
 def check_base(config: Config, base: BaseStation | None) -> None:
-    """Raise SettingsError if the settings require a missing base station, or do not allow the given base station."""
+    """Raise SettingsError if the settings require a base station and none is given, or do not allow the given one."""
     if config.carrier == "fixed" and base is None:
         raise SettingsError("carrier = fixed: integers require a base station (--base); otherwise set carrier = float")
     if config.sbas and base is not None:

@@ -165,7 +165,7 @@ def _lasting(
 ) -> tuple[Ranges, Phases]:
     """Return ranges and phases with weights reduced because multipath persists for `PhaseLimits.correlation_s`.
 
-    The first epoch of an arc has full weight, so that the factors of an arc add up to its number of independent epochs.
+    The first epoch of an arc has full weight, so that the factors in an arc add up to its number of independent epochs.
     """
     before = last_arcs(corrected.satellite, corrected.signal, state.arcs)
     latest = np.maximum.accumulate(np.concatenate([before[None], phases.arc_id]))

@@ -47,7 +47,7 @@ class ChannelBook:
         self._known: dict[tuple[object, ...], Channels] = {}
 
     def of(self, obs: Observations, navigation: Navigation) -> Channels:
-        """Return the selected channels. GLONASS frequencies are those of the log, otherwise of the records."""
+        """Return the selected channels. GLONASS frequencies are taken from the log, else from navigation records."""
         glonass = {**glonass_channels(navigation), **obs.header.glonass_channel}
         key = (
             obs.satellite.tobytes(),

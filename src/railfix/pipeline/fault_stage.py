@@ -27,7 +27,7 @@ from railfix.positioning.range_arrays import Ranges
 from railfix.positioning.receiver_noise import NoiseState, noise_scale
 from railfix.ranges.corrected import CorrectedRanges
 
-#: Epochs count towards the noise scale up to this ratio of residual to assumed variance: (100 sigmas)^2.
+#: Epochs do not affect the noise scale if residual variance / assumed variance exceeds this: (100 sigmas)^2.
 _LARGEST_VARIANCE: Final = 1e4
 
 
@@ -57,7 +57,7 @@ def check_ranges(
     """
     time, near = corrected.time, corrected.near_ecef_m
     on, noises = "raim" in config.screens, [state.noise for state in states]
-    learning, least = config.noise_scale, 1.0 if config.sbas else 0.0  # SBAS sigmas are overbounds: no smaller scale
+    learning, least = config.noise_scale, 1.0 if config.sbas else 0.0  # SBAS sigmas are overbounds: scale >= 1
     windows = Windows.of(
         time, antennas.parts, [(noise.time, noise.age) for noise in noises],
         window_s=learning.window_s, least_epochs=learning.least_epochs,

@@ -91,7 +91,7 @@ class TrackFeatures:
 class FeatureFix:
     """Verdict on one feature."""
 
-    tick: int  #: Index of the tick after which the feature was passed.
+    tick: int  #: Index of the first tick at which the body's middle is `HALF_LENGTH_M` beyond the feature.
     feature: Feature
     located: LocatedFeature
 
@@ -108,7 +108,7 @@ class _Stretch(NamedTuple):
     sense: float  #: Direction: 1 toward rising arc length, else -1.
     distance_m: Floats  #: Wheel distance at all ticks of the chunk; index 0 is the tick before the chunk.
     body_m: Floats  #: Position of the body's middle at each tick of the stretch.
-    #: Position `HALF_LENGTH_M` behind the body's middle, up to which features are compared, at each tick.
+    #: Position `HALF_LENGTH_M` behind the body's middle at each tick; features up to it are compared.
     behind_m: Floats
     metre: Integers
     heading_rad: Floats
@@ -156,10 +156,10 @@ def feature_fixes(
 ) -> tuple[list[FeatureFix], FeatureState]:
     """Return verdicts on the features that the train has passed, and the state for the next chunk.
 
-    A feature is compared once the body's middle is `HALF_LENGTH_M` beyond it. Only ticks without slip and faster than 1
-    m/s are used. Other ticks are breaks, which restart the integration of heading and pitch. `facing` is 1 if the front
-    points to rising arc length, else -1; `sigma_m` is the standard deviation of the wheel position; `noise` has the
-    standard deviations of gradient and curvature over one metre.
+    A feature is compared as soon as the body's middle is `HALF_LENGTH_M` beyond it. Only ticks without slip and faster
+    than 1 m/s are used. Other ticks are breaks, which restart the integration of heading and pitch. `facing` is 1 if
+    the front points to rising arc length, else -1; `sigma_m` is the standard deviation of the wheel position; `noise`
+    has the standard deviations of gradient and curvature over one metre.
     """
     distances = np.concatenate([[0.0], rates.distance_m]) + state.distance_m
     heading, pitch = (

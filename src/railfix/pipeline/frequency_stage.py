@@ -22,9 +22,9 @@ from railfix.screens import Screened, Verdict
 NAME: Final = "two_frequencies"
 #: Arc over which the ionospheric model error is correlated [rad]: 1000 km.
 _IONOSPHERE_ARC: Final = 0.157
-#: Deviation of a delay from a plane over the sky, as a fraction of the delay. For Galileo, it was 0.06 at a station in
-#: a solar minimum (mean delay 1.5 m), 0.02 on a drive in Japan (3.9 m), and 0.05 on a roof in Japan in 2024 (6.4 m).
-#: Walter et al. (Navigation 48, 2001) use 0.35 m.
+#: Deviation of a satellite's delay from a common offset with two gradients over the sky, as a fraction of the delay.
+#: For Galileo, it was 0.06 at a station in a solar minimum (mean delay 1.5 m), 0.02 on a drive in Japan (3.9 m), and
+#: 0.05 on a roof in Japan in 2024 (6.4 m). Walter et al. (Navigation 48, 2001) use 0.35 m.
 _IONOSPHERE_REST: Final = 0.05
 
 

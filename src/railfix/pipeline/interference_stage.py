@@ -48,7 +48,7 @@ _MOST_WRONG: Final = 2
 #: Largest number of satellites of one clock with individual gross errors.
 _MOST_GROSS: Final = 4
 _NOT_ITS_SIGNAL: Final = int(Reason.OTHER_SIGNAL_TAKEN)
-#: Statuses of positions that suspected spoofing replaces.
+#: Position statuses that are replaced if spoofing is suspected.
 _UNDER_SPOOFING: Final = np.isin(np.arange(len(Status)), [
     Status.OK, Status.AMBIGUOUS, Status.OFF_MAP, Status.INCONSISTENT, Status.ANTENNAS_DISAGREE, Status.UNCERTAIN,
     Status.MAP_OFFSET, Status.MAP_END,
@@ -135,7 +135,7 @@ def _motion_inputs(
 
 
 def _named_as_wrong(reason: Bits, groups: Sequence[slice]) -> Masks:
-    """Return a mask (T, K) of satellites with individual errors, at epochs with fewer of them than spoofing affects."""
+    """Return a mask (T, K) of satellites with individual errors; False if as many have errors as under spoofing."""
     wrong, gross = (reason & _WRONG_ALONE) != 0, (reason & int(Reason.GROSS_ERROR)) != 0
     named = wrong & (wrong.sum(axis=1, keepdims=True) <= _MOST_WRONG)
     for group in groups:

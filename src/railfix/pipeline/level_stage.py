@@ -121,7 +121,7 @@ def level_stage(
     offset: MapOffset,
     config: Config,
 ) -> tuple[ProtectionResult | None, Masks]:
-    """Return protection levels (None if off), and a mask (T,) of epochs with a possible position beyond the level."""
+    """Return protection levels (None if off), and whether another possible position is beyond the level, shape (T,)."""
     fix, model, raim, scale, *_ = checked
     if config.protection != "on" or config.carrier in ("float", "fixed"):
         return None, np.zeros(len(ranges), dtype=bool)

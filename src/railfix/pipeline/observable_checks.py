@@ -24,12 +24,12 @@ from railfix.ranges.corrected import CorrectedRanges
 _LEAST_RATE_MPS: Final = 100.0
 #: Minimum number of satellites for a factor; at least one more must be observed, for the median rate.
 _LEAST_SATELLITES: Final = 3
-#: With at least this number of satellites, one satellite's factor may deviate. Among four, a satellite with a cycle
-#: slip changes the factors of the others.
+#: With at least this number of satellites, one satellite's factor may deviate. With only four satellites, a cycle slip
+#: of one changes the factors of the others.
 _MANY: Final = 6
 #: Largest deviation of a satellite's factor from the median factor.
 _SPREAD: Final = 0.3
-#: Largest deviation of a correct factor from 1, to which the speed of the train contributes.
+#: Largest deviation of a correct factor from 1; the speed of the train causes part of it.
 _RIGHT: Final = 0.5
 #: Longest time between two epochs whose phases are compared [s].
 _LONGEST_S: Final = 35.0

@@ -12,9 +12,9 @@ from railfix.core.arrays import Datetimes, Floats, Masks
 from railfix.core.timescale import seconds
 
 _NEVER: Final = np.datetime64("NaT", "ns")
-#: Time constant of the mean offset of a train off the map [s].
+#: Time constant of the mean offset from the line while a train is off the map [s].
 _REMEMBERED_S: Final = 30.0
-#: Largest ratio of the mean offset on the map to the mean offset off the map at which a train is back on the line.
+#: A train is back on the line if its mean offset on the map is at most this fraction of its mean offset off the map.
 _BACK_SHARE: Final = 0.5
 #: A train is also back on the line if the mean offset of its positions is at most this limit [m].
 _BACK_M: Final = 1.0
@@ -25,7 +25,7 @@ class OffMapState:
     """State of the off-map test after a chunk."""
 
     off: bool = False  #: True if the train was off the map at the last epoch.
-    known: bool = False  #: True once a position has been tested; the first position alone determines `off`.
+    known: bool = False  #: True after the first tested position; until then, one position is enough to set `off`.
     #: Time of the first of the latest consecutive positions that contradict `off`; NaT if the last position agrees with
     #: `off`.
     since: np.datetime64 = _NEVER

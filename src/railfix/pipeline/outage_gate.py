@@ -18,7 +18,7 @@ _OUTAGE_S: Final = 2.0
 _AGREEING: Final = 3
 #: Standard deviation of a sensor distance since the start of a block, as a fraction of the distance.
 _DISTANCE_SHARE: Final = 0.01
-#: Minimum standard deviation of a single epoch at the end of a tunnel [m], because of multipath at the portal.
+#: Minimum standard deviation of a single-epoch position at the end of a tunnel, where the portal causes multipath [m].
 _LEAST_SIGMA_M: Final = 2.0
 _NEVER: Final = np.datetime64("NaT", "ns")
 

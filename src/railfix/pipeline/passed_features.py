@@ -16,7 +16,7 @@ SLOWEST_MPS: Final = 1.0
 
 
 def ahead_m(trajectory: Trajectory) -> float:
-    """Return the distance of an antenna ahead of the vehicle's middle in rising arc length [m]; 0 without a vehicle."""
+    """Return the chainage of an antenna minus the chainage of the vehicle's middle [m]; 0 without a vehicle."""
     if trajectory.body_chainage_m is None:
         return 0.0
     return float(np.median(trajectory.chainage_m - trajectory.body_chainage_m))
@@ -60,7 +60,7 @@ class FeatureState:
 class PassedFeature(NamedTuple):
     """Position measured with a feature of the line that the train has passed."""
 
-    tick: int  #: Index of the tick after which the feature was passed.
+    tick: int  #: Index of the tick at which the feature was compared, after the body's middle had passed it.
     correction_m: float  #: Measured position minus wheel position.
     #: Standard deviation of the position, including errors of the map and of the body's position on the bogies.
     sigma_m: float

@@ -213,7 +213,7 @@ def _published(
 
 
 def _nominal_variance_m2(model: LinearModel, nominal_elevation_sigma_m: Floats) -> Floats:
-    """Return the along-line variance due to satellite and atmospheric errors that the range sigmas omit [m^2]."""
+    """Return the along-line variance of satellite and atmospheric errors that are not in the range sigmas [m^2]."""
     share = (
         model.gain_m[..., 0] * model.root_weight * np.where(model.used, np.fmax(nominal_elevation_sigma_m, 0.0), 0.0)
     )
@@ -221,9 +221,9 @@ def _nominal_variance_m2(model: LinearModel, nominal_elevation_sigma_m: Floats) 
 
 
 def _ambiguity_variance_m2(ranges: Ranges, antennas: AntennaRows, fix: LineFix, arc: Floats, config: Config) -> Floats:
-    """Return the squared distance to the best alternative position, times its probability, shape (T,) [m^2].
+    """Return the squared distance to the best alternative, times the alternative's probability, shape (T,) [m^2].
 
-    If its weighted sum of squares is larger by x, its probability is ``1/(1 + exp(x/2))`` (equal priors, normal noise).
+    The probability is ``1/(1 + exp(x/2))`` if the weighted squares are larger by x there (equal priors, normal noise).
     """
     section, square = fix.section, np.zeros(len(ranges))
     open_ones = (section.other_vertex >= 0) & (section.excess <= config.section.threshold) & np.isfinite(arc)

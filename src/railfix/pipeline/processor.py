@@ -399,7 +399,7 @@ class EpochProcessor:
                 yield from (f"{name}: {note}" for note in curve.notes_for(header))
 
     def _line_references(self, name: str) -> LineReferences:
-        """Return the ground units, the balises, and the line features if the filter uses features."""
+        """Return the ground units, the balises and, if the filter uses features, the line features."""
         features = self._features.get(name) if "feature" in self.config.filter_sources else None
         return LineReferences(features=features, units=self.units, balises=self.balises)
 

@@ -41,7 +41,7 @@ _TICK_NS: Final = 20_000_000
 _MEAN_NS: Final = 200_000_000
 #: Time for which a lost or doubled pulse disturbs the wheel acceleration [ns].
 _FAULT_NS: Final = _MEAN_NS + 150_000_000
-#: Length of time before the last epoch from which the next chunk needs samples.
+#: The next chunk needs the samples of this interval before the last epoch.
 REACH: Final = np.timedelta64(_MEAN_NS + 200_000_000, "ns")
 #: Motion states in which the inertial unit provides the distance.
 CARRIED: Final = (

@@ -33,7 +33,7 @@ from railfix.ranges.channels import PLAUSIBLE_CODE_M, channel_order, first_avail
 _STEP_S: Final = 1.0  #: Time step of the numerical derivatives of satellite clocks and tropospheric delays [s].
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.
 _PASSES: Final = 3  #: Number of passes of outlier rejection. Each pass uses the noise scale of the previous fit.
-_TELLING: Final = 2.0  #: Normalised variances up to this many standard deviations above 1 count as 1.
+_TELLING: Final = 2.0  #: Normalised variances count as 1 unless they exceed 1 by more than this many sigmas.
 _FLOOR_MPS: Final = 0.02  #: Noise of a Doppler at high C/N0.
 
 
@@ -44,8 +44,8 @@ class DopplerSpeedLimits(Settings):
     #: Noise of a Doppler at 45 dB-Hz: ``sigma^2 = floor^2 + (zenith 10^((45 - min(C/N0, 50)) / 20))^2``. Only the
     #: relative noise of Dopplers affects the speed, because the noise scale is estimated from the residuals of the log.
     zenith_mps: float = Field(default=0.03, gt=0)
-    #: Largest normalised residual of a Doppler that is not rejected (w-test of Baarda, 1968). Of several, the Doppler
-    #: with the largest residual is rejected first.
+    #: Largest normalised residual of a Doppler that is not rejected (w-test of Baarda, 1968). If several Dopplers
+    #: exceed it, the largest residual is rejected first.
     outlier: float = Field(default=3.5, gt=0)
     most_rejected: int = Field(default=8, ge=0)  #: Largest number of Dopplers rejected per epoch.
     min_satellites: int = Field(default=4, ge=3)  #: Minimum number of Dopplers per epoch.

@@ -29,8 +29,8 @@ GROSS_M: Final = 100.0
 AGREEING_M: Final = 30.0
 #: Minimum number of redundant ranges after an exclusion at a 3-D position, so that the result can be tested.
 _LEFT_IN_SPACE: Final = 3
-#: With fewer redundant ranges than `_LEFT_IN_SPACE`, residuals after all other exclusions must be larger by this
-#: factor.
+#: With fewer redundant ranges than `_LEFT_IN_SPACE`, a range is excluded only if all other exclusions leave residuals
+#: larger by this factor.
 _CLEARER: Final = 5.0
 #: Corrected codes with residuals above this multiple of the robust scale disagree with the other codes.
 _DISAGREE: Final = 5.0
@@ -161,7 +161,7 @@ _CLOCKS_APART_M: Final = 200.0
 _CLOCK_AWAY_M: Final = 600.0
 #: Largest product of points, epochs and channels of a block.
 _BLOCK: Final = 2_000_000
-#: Smallest cost difference between exclusions that is clear, as a fraction of `GROSS_M`.
+#: The least cost is clear if all alternatives cost more by this fraction of `GROSS_M`.
 _CLEAR: Final = 0.7
 #: Minimum number of redundant ranges that agree with a point of the line.
 _LEFT_ON_LINE: Final = 2
@@ -178,7 +178,7 @@ class LineScan(NamedTuple):
 
 
 def scan_line(ranges: Ranges, line: Trajectory) -> LineScan:
-    """Find the point of a line with the least robust cost of each epoch's raw ranges.
+    """Find, for each epoch, the point of a line at which the raw ranges have the least robust cost.
 
     Each clock's median residual is subtracted. The cost of a point is the sum of the absolute residuals, each limited
     to `GROSS_M`, so that larger errors do not increase the cost. After a coarse scan of the whole line, the
@@ -214,9 +214,9 @@ def _line_residuals(ranges: Ranges, place_ecef_m: Floats) -> Floats:
     unused.
 
     If residuals of a clock agree with the median of all clocks within `_CLOCKS_APART_M`, only these residuals determine
-    the median of the clock. For an even number, the median is the mean of the lower and the upper median, or the lower
-    or upper median if its `_capped_cost` is clearly smaller. This is necessary because the mean fits no range if half
-    of the ranges have gross errors.
+    the median of the clock. For an even number, the median is the mean of the two middle values, or one of these if its
+    `_capped_cost` is clearly smaller. This is necessary because the mean fits no range if half of the ranges have gross
+    errors.
     """
     used, satellite = ranges.weight > 0, ranges.sat_ecef_m
     square = -2.0 * (place_ecef_m @ satellite.swapaxes(1, 2))
@@ -257,7 +257,7 @@ class GrossErrors(NamedTuple):
 
 #: Smallest and largest plausible ellipsoidal height of trains, with a margin [m].
 _HEIGHTS_M: Final = (-500.0, 10_000.0)
-#: Epochs with a smaller root of the sum of squared raw residuals are not examined [m].
+#: Epochs whose raw residuals have a root sum of squares below this are not examined [m].
 _QUIET_M: Final = 30.0
 #: Epochs with a 3-D position farther from the line are also examined [m].
 _BESIDE_M: Final = 1000.0

@@ -59,7 +59,7 @@ def compute_information(axes: Floats, sigma_plan_m: float, sigma_height_m: float
 def robust_fit(
     ranges: Ranges, place_ecef_m: Floats, *, information: Floats | None = None, limits: RobustFitLimits | None = None
 ) -> RobustFit:
-    """Find the ranges of each epoch that agree with each other by IGG-III weights (Yang, Song and Xu, 2002).
+    """Find, with IGG-III weights (Yang, Song and Xu, 2002), the ranges of each epoch that agree with each other.
 
     `place_ecef_m`, shape (T, 3), are the positions at which the ranges are linearised.
 
@@ -93,7 +93,7 @@ def robust_on_line(
     near_ecef_m: Floats | None = None,
     limits: RobustFitLimits | None = None,
 ) -> RobustFit:
-    """Find the ranges that agree at positions on the line, by IGG-III weights (Yang, Song and Xu, 2002).
+    """Find, with IGG-III weights (Yang, Song and Xu, 2002), the ranges that agree at positions on the line.
 
     Without a position, ranges are linearised at `near_ecef_m`, shape (T, 3) [m]; default: the middle of the line.
     """

@@ -81,7 +81,7 @@ class Constrained(NotebookTable):
     exact_map_sigma_m: Floats  #: Standard deviation along the line for an exact map, shape (T,).
     #: Standard deviation along the line for unit weights and an exact map, shape (T,); infinite if undetermined.
     dilution: Floats
-    #: Distance beyond the end of the line at which the ranges fit best, shape (T,); 0 for positions not at an end.
+    #: Distance from the end of the line to the best-fitting position beyond it, shape (T,); 0 if not at an end.
     overshoot_m: Floats
     clock_m: Floats  #: Receiver clock of each group, shape (T, G).
     wsse: Floats  #: Weighted sum of squared residuals, including the map error, shape (T,).

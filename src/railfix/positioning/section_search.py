@@ -45,12 +45,12 @@ class SectionLimits(Settings):
 
     @cached_property
     def threshold(self) -> float:
-        """Largest excess of q of an ambiguous section, for noise of unit variance."""
+        """Excess of q up to which an alternative makes a section ambiguous, for noise of unit variance."""
         return float(scipy.special.chdtri(1, self.ambiguity_risk))
 
     @cached_property
     def reach(self) -> float:
-        """Largest excess of q of an alternative position, for noise of unit variance."""
+        """Excess of q up to which alternative positions are searched, for noise of unit variance."""
         return float(scipy.special.chdtri(1, min(_REACH_RISK, self.ambiguity_risk)))
 
 

@@ -126,7 +126,7 @@ _NEGLIGIBLE: Final = -5.0
 class MeanPhases:
     """Mean double differences of one antenna's carrier phases, for n satellite pairs."""
 
-    difference_m: Floats  #: Observed minus computed at the origin, modulo the wavelength, shape (n,).
+    difference_m: Floats  #: Observed minus computed (at the origin), modulo the wavelength, shape (n,).
     away: Floats  #: Derivatives with respect to the position east, north and up, shape (n, 3).
     wavelength_m: Floats  #: Carrier wavelength of each pair, shape (n,).
     covariance_m2: Floats  #: Covariance of `difference_m`, shape (n, n).

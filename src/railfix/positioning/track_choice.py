@@ -28,7 +28,7 @@ from railfix.track.network import ANTENNA_SIGMA_M, ANTENNA_UP_M, CLEARANCE_M, UN
 _ALONG_M: Final = 0.25
 #: Integration step across the track [m].
 _ACROSS_M: Final = 0.3
-#: Relative weight of an unmapped track within the clearance of a mapped track, which is possible only if the map is
+#: Relative weight of an unmapped track within the clearance of a mapped track; such a track exists only if the map is
 #: displaced. An unmapped track farther away has the weight 1.
 _BETWEEN_SHARE: Final = 0.1
 #: Minimum distance of an unmapped track from a mapped track [m].
@@ -37,12 +37,12 @@ _BETWEEN_M: Final = 1.2
 _LARGEST_MISFIT: Final = 4.0
 #: The likelihood is integrated up to this distance before and behind the code position [m].
 _REACH_M: Final = 40.0
-_LEAST_ELEVATION_DEG: Final = 10.0  #: Errors at lower elevations are those at this elevation.
+_LEAST_ELEVATION_DEG: Final = 10.0  #: Errors below this elevation are as large as at this elevation.
 #: Residual atmospheric error of the phase difference of two receivers, as a fraction of the distance between them.
 _PHASE_SHARE: Final = 1e-6
-#: Phases are not evaluated for hypotheses whose log likelihood from codes is farther below the largest than this.
+#: Phases are not evaluated for hypotheses whose log likelihood from codes is more than this below the largest.
 _UNLIKELY: Final = 25.0
-#: Standard deviation assumed in the phase search for the position along the track and for the height [m].
+#: In the phase search, the position along the track and the height have this standard deviation [m].
 _ANY_PLACE_M: Final = 50.0
 #: Significance level of the chi-square test of the code residuals.
 _MISFIT: Final = 1e-4

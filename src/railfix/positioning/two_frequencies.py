@@ -28,7 +28,7 @@ from railfix.positioning.noise_windows import correlated_sums
 from railfix.ranges.corrected import SecondCodes
 
 _FROM_MEAN_SIZE: Final = 1.2533  #: Inverse of the mean absolute value of a standard normal variable.
-_FIRST_SAMPLES: Final = 2.0  #: Number of prior samples; they have the assumed noise.
+_FIRST_SAMPLES: Final = 2.0  #: Number of samples that the prior noise scale of 1 counts as.
 _CLIP: Final = 2.5  #: Clipping limit of a satellite's mean code difference, in sigmas.
 _LEAST_SUSPICION_M: Final = 3.0  #: Minimum code difference of a suspected range [m].
 

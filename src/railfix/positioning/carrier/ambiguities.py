@@ -59,7 +59,7 @@ def number_hops(time: Datetimes, limits: PhaseLimits) -> Integers:
 
 
 def count_repeats(time: Datetimes, limits: PhaseLimits) -> Floats:
-    """Return the number of epochs per correlation time from each epoch's interval, at least 1, shape (T,)."""
+    """Return the correlation time divided by the interval since the previous epoch, at least 1, shape (T,)."""
     step = np.append(np.nan, seconds(np.diff(time)))
     with np.errstate(divide="ignore"):
         share = limits.correlation_s / step
@@ -72,8 +72,8 @@ class ArcAmbiguities:
 
     arc_id: Integers  #: Number of each arc (`number_arcs`), shape (A,).
     #: Phase minus distance minus clock, shape (A,). It contains whole cycles, phase wind-up and signal delays. With a
-    #: separate phase clock, ambiguities are determined except for a common constant. The mean of the corrections to
-    #: their first values is then set to zero, and the covariance is relative to this mean.
+    #: separate phase clock, ambiguities are determined except for a common constant. The mean of the corrections to the
+    #: ambiguities' first values is therefore set to zero, and the covariance is relative to this mean.
     ambiguity_m: Floats
     covariance_m2: Floats  #: Noise covariance without the map error, shape (A, A).
 

@@ -3,8 +3,8 @@
 The phase change is compared with the Dopplers, ``(phase_k - phase_{k-1}) + lambda (D_k + D_{k-1}) / 2 dt``, or, where
 Dopplers are missing, with the code change. The median over the channels is subtracted, because a receiver clock step is
 common to all channels. The true interval between epochs is the difference of the time tags minus the clock step of the
-codes. Some receivers step the phases together with the codes. If the phases continue without the step, they differ from
-the codes by whole milliseconds, which are added in `Slips.phase_m`.
+codes. Some receivers step the phases together with the codes. If the phases do not have the step, they differ from the
+codes by whole milliseconds; `Slips.phase_m` has these added.
 
 The smoothed code is the phase plus the mean of code minus phase over the arc so far. This mean drifts by twice the
 change of the ionospheric delay. The window limits the effect: for a change of 1 mm/s and a window of 100 s, the error
@@ -30,7 +30,7 @@ from railfix.positioning.carrier.continuity import ChannelKeys, channel_keys, ro
 
 #: Clock step of one millisecond [m], used by receivers that keep their clock near GPS time.
 MILLISECOND_M: Final = 1e-3 * SPEED_OF_LIGHT
-#: Larger common changes of all codes count as receiver clock steps [m].
+#: A change common to all codes is a receiver clock step if it is larger than this [m].
 _CLOCK_STEP_M: Final = 1e4
 _COMMON: Final = 3  #: Minimum number of channels for a median.
 
@@ -77,10 +77,10 @@ class CycleSlipState:
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: NaT before the first epoch.
     channels: ChannelKeys = ()
     code_m: Floats = field(default_factory=lambda: np.empty(0))  #: Code, shape (M,).
-    phase_m: Floats = field(default_factory=lambda: np.empty(0))  #: Received phase without `step_ms`, shape (M,).
+    phase_m: Floats = field(default_factory=lambda: np.empty(0))  #: Phase before adding `step_ms`, shape (M,).
     doppler_mps: Floats = field(default_factory=lambda: np.empty(0))  #: Doppler times wavelength, shape (M,).
     half_cycle: Masks = field(default_factory=lambda: np.empty(0, dtype=np.bool_))  #: Shape (M,).
-    step_ms: int = 0  #: Sum of all clock steps of the codes that the phases lack [ms].
+    step_ms: int = 0  #: Sum of the clock steps of the codes that did not occur in the phases [ms].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,7 +196,7 @@ def find_slips(
 def slip_metrics(
     dt: Floats, code_m: Floats, phase_m: Floats, range_mps: Floats
 ) -> tuple[Floats, Integers, Floats, Floats]:
-    """Return the clock step of the codes [m], its part that the phases lack [ms], and the metrics of both tests.
+    """Return the codes' clock step [m], the part of it missing in the phases [ms], and the metrics of both tests.
 
     `dt`, shape (T,), is the time since the previous epoch. `code_m` and `phase_m`, shape (T, M), are the changes since
     the previous epoch, and `range_mps` is the mean range rate from the Dopplers.

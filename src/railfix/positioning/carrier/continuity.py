@@ -139,7 +139,7 @@ class TrackedPhases(NamedTuple):
 
     phase_m: Floats  #: Corrected phases (`observation_model.corrected_phase_m`), shape (T, M); NaN if unused.
     sat_ecef_m: Floats  #: Satellite positions of the phases, shape (T, M, 3).
-    slip: Masks  #: True where a slip is already known and not tested, shape (T, M).
+    slip: Masks  #: True where a slip is already known, so that the phase is not tested, shape (T, M).
 
 
 def track_jumps(
