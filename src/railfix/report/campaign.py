@@ -160,7 +160,7 @@ def _worst_of_pieces(table: pl.DataFrame) -> pl.DataFrame:
 def _worst(pieces: pl.DataFrame, quantity: str, out: Path) -> Table:
     """Write the explanations of the worst epochs to files, and return a table of these epochs with links to the files.
 
-    An epoch of a run without observations has no explanation.
+    Epochs of runs that did not write observations have no explanation.
     """
     ranked = pieces.filter(pl.col(quantity).is_finite()).sort(pl.col(quantity).abs(), descending=True)
     event = pl.col("time_gpst").dt.truncate(f"{_EVENT_S}s").alias("event")

@@ -309,7 +309,7 @@ def figure(
     linked: str = "",
     width: str = "",
 ) -> Figure:
-    """Return the figure of a chart with its values for the script of the page.
+    """Return the figure of a chart, with the values of the chart for the script of the page.
 
     `numbers` yields the numbers of figures. The times of the points are counted from the start of `group`; a click on a
     point with a time shows the satellites in the sky plot `sky`. `anchor` is a prefix of the name of the x axis that

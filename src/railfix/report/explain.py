@@ -32,18 +32,18 @@ from railfix.track import Trajectory
 SINGLE_STATUS: Final[Mapping[str, str]] = {
     "ok": "passed every check",
     "ambiguous": "another position on the line fits the ranges equally well",
-    "off_map": "the position is beyond an end of the map, or too far from the position without the map",
-    "map_end": "moved to an end of the map; the ranges place it slightly beyond that end",
+    "off_map": "the position is beyond an end of the map, or too far from the position computed without the map",
+    "map_end": "the position was moved to an end of the map, because the ranges place it slightly beyond that end",
     "too_few_satellites": "no position: too few usable satellites",
     "unobservable": "no position: the satellite geometry does not determine the position along the line",
     "no_convergence": "no position: the iteration did not converge",
     "no_observation": "no position: the antenna has no observation",
     "inconsistent": "the ranges are inconsistent, and no exclusion resolves the inconsistency",
-    "antennas_disagree": "the distance between the two antennas' positions disagrees with the antenna spacing",
+    "antennas_disagree": "the distance between the positions of both antennas differs too much from their spacing",
     "uncertain": "the standard deviation of the position exceeds the limit",
     "map_offset": "the positions of the last minutes lie off the line: the map is wrong here, or the train is on "
     "another track",
-    "jamming_suspected": "passed every check, but the signals are jammed (column interference_causes)",
+    "jamming_suspected": "the position passed every check, but the signals are jammed (column interference_causes)",
     "spoofing_suspected": "the signals may come from a spoofer (column interference_causes)",
 }
 #: Explanation of each status of the filter.
@@ -51,15 +51,15 @@ FILTER_STATUS: Final[Mapping[str, str]] = {
     "tracking": "one position, from measurements of this epoch",
     "several_branches": "several positions are possible; the most probable one is given",
     "coasting": "predicted: no measurement of this epoch was accepted",
-    "lost": "measurements contradict the track: positions are searched for again",
+    "lost": "measurements contradict the track, and the line is searched for other positions",
     "expired": "no position: dead reckoning has lasted too long",
     "not_started": "no position yet: no epoch so far had redundant codes",
     "off_map": "no position: the positions from satellites have been off the line for some time",
     "map_offset": "the positions of the last minutes lie off the line: the map is wrong here, or the train is on "
     "another track",
-    "antennas_disagree": "the distance between the two antennas' positions disagrees with the antenna spacing",
-    "doubtful": "measurements contradict the position or its bound: the error is not bounded",
-    "spoofing_suspected": "the signals may come from a spoofer: the error is not bounded",
+    "antennas_disagree": "the distance between the positions of both antennas differs too much from their spacing",
+    "doubtful": "measurements contradict the position or its protection level, and the error is not bounded",
+    "spoofing_suspected": "the signals may come from a spoofer, and the error is not bounded",
 }
 #: Columns of `Explanation.satellites` with the effect of omitting the satellite: shift of the position, and sigma of
 #: the position without the satellite.
@@ -100,9 +100,9 @@ class Explanation:
 def explain_epoch(run: Path, at: str, *, antenna: str | None = None) -> Explanation:
     """Explain the epoch of one antenna that is nearest to the GPS time `at`: ``hh:mm:ss``, optionally after a date.
 
-    The default antenna is the first antenna of the run. A time without a date may be on any day of the run. Raise
-    InputFileError if the run wrote no observations. Raise SettingsError if the antenna or the time is invalid. Raise
-    MismatchError if no epoch is within a minute.
+    The default antenna is the first antenna of the run. A time without a date is searched for on all days of the run.
+    Raise InputFileError if the run wrote no observations. Raise SettingsError if the antenna or the time is invalid.
+    Raise MismatchError if no epoch is within a minute.
     """
     folder = read_run(run)
     if not (run / "observations.parquet").is_file():

@@ -290,7 +290,7 @@ def _worst(errors: pl.DataFrame | None) -> Datetimes | None:
 
 
 def _tunnels(errors: pl.DataFrame | None) -> list[tuple[float, float]]:
-    """Return the first and last chainage [m] of each tunnel: two or more consecutive epochs with the environment
+    """Return first and last chainage [m] of each tunnel: at least two consecutive epochs with the environment
     ``tunnel``.
     """
     if errors is None:

@@ -222,7 +222,7 @@ def write_page(
     background: Sequence[Floats] = (),
     title: str = "",
 ) -> Path:
-    """Write the report on runs that have been read (`read_runs`) as an HTML page, and return its path.
+    """Write an HTML page with the report on runs that `read_runs` has read, and return the path of the page.
 
     For `background` see `report_page`. Raise OutputError if the page cannot be written.
     """

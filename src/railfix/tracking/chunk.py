@@ -45,7 +45,7 @@ class Chunk:
 
 
 def prepare_chunk(epochs: GnssEpochs, state: TrackState, limits: TrackingLimits) -> Chunk:
-    """Return the chunk, and add the errors of newly observed satellites to the unknowns of the state."""
+    """Return the epochs as a chunk, and add the errors of newly observed satellites to the unknowns of the state."""
     state.origin = epochs.time[0] if np.isnat(state.origin) else state.origin
     phase, before = _previous(epochs.channel, state.previous)
     phase = np.concatenate([phase[None], epochs.phase_m])

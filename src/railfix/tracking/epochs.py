@@ -47,8 +47,8 @@ class GnssEpochs:
     #: True where the train is known to be away from the line, shape (T,). At these epochs the filter is reset, and no
     #: measurement is used.
     off_map: Masks
-    #: Error of the ionospheric model divided by its error in a quiet ionosphere, shape (T,); None for 1. Values above 1
-    #: increase sigma and protection level. The value is 0 for ionosphere-free codes.
+    #: Error of the ionospheric model divided by its error in a quiet ionosphere, shape (T,); None if all are 1. Values
+    #: above 1 increase sigma and protection level. The value is 0 for ionosphere-free codes.
     tilt_scale: Floats | None = None
     #: Position computed without the line, accurate to a few hundred metres, shape (T, 3). The antenna velocity is
     #: computed at this position, and is not available where the position is NaN or None.
@@ -97,7 +97,7 @@ class BaliseEpochs:
 
     @classmethod
     def none(cls, epochs: int) -> BaliseEpochs:
-        """Return the measurements of T epochs without balises."""
+        """Return the measurements of T epochs at which no balise was read."""
         place_m, sigma_m = np.full((2, epochs, 2), np.nan)
         return cls(time=np.zeros((epochs, 2), dtype="datetime64[ns]"), place_m=place_m, sigma_m=sigma_m)
 
@@ -139,7 +139,7 @@ class SensorEpochs:
 
 @dataclass(frozen=True, kw_only=True)
 class Previous:
-    """Last epoch of the previous chunk, from which the first phase changes of a chunk are computed."""
+    """Last epoch of the previous chunk; the first phase changes of a chunk are computed from it."""
 
     channel: Strings  #: Channel names, shape (K,).
     sat_ecef_m: Floats  #: Satellite positions, shape (K, 3).

@@ -80,7 +80,7 @@ class Recursion:
         """Process epochs from `first` on, and update the state.
 
         Only the epoch `first` is processed if `found` is the result of a position search at this epoch, or if a `trace`
-        is required. Return the index of the next epoch, and the reasons for a position search there (0 for none).
+        is required. Return the index of the next epoch, and the reasons for a position search at it (0: no search).
         """
         count, width = state.mean.shape
         last = len(self.chunk.time) if trace is None and found is None else first + 1

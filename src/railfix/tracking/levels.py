@@ -179,7 +179,7 @@ def carried_levels(
     """Return the main filter's results, with protection levels propagated from the epochs of the second filter.
 
     `tracked` are the main filter's results. The second filter, which has sub-filters, ran at the epochs `taken`, with
-    the results `with_bank` (None without such epochs). `state` is the second filter's state before the chunk; its state
+    the results `with_bank` (None if `taken` is empty). `state` is the second filter's state before the chunk; its state
     after the chunk is returned, too.
     """
     number = taken.searchsorted(np.arange(len(tracked)), side="right")

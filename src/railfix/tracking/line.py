@@ -75,7 +75,7 @@ class Line:
         return back
 
     def nearest_m(self, arc_m: Floats, to_m: Floats) -> Floats:
-        """Return arc lengths [m], on a closed line shifted by whole laps so that they are nearest to `to_m` [m]."""
+        """Return arc lengths [m]; on a closed line, they are shifted by whole laps to be nearest to `to_m` [m]."""
         if not self.closed:
             return arc_m
         back = self.round_m(to_m)

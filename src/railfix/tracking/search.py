@@ -251,13 +251,13 @@ def _begin_elsewhere(state: TrackState, arc: Floats, line: Line, limits: Trackin
     log_probability = state.hypothesis["log_probability"]
     best = int(np.argmax(log_probability))
     elsewhere = 1.0 if weak or state.monitors.contradiction >= constants.CONTRADICTION_TAKEN else _ELSEWHERE
-    # A hypothesis less probable than a new hypothesis has drifted away from the position that the codes determine.
+    # A hypothesis that is less probable than a new one has drifted away from the position that the codes determine.
     alive = log_probability >= np.log(elsewhere / len(arc))
     going = state.mean[best : best + 1, ix.ARC] if weak else state.mean[alive, ix.ARC]
     there = line.nearest_m(arc[:, None], going)
     arc = arc[(np.abs(there - going) > limits.start_separation_m).all(axis=1)]
-    # If the weights were low, a hypothesis begins at the old position too, with a large variance that codes can reduce.
-    # If only the velocity contradicts the position, the old hypotheses continue.
+    # If the weights were low, a hypothesis also begins at the old position, with a large variance that codes can
+    # reduce. If only the velocity contradicts the position, the old hypotheses continue.
     arc = np.concatenate([going, arc]) if weak else arc
     fresh = begin(arc, len(state.satellite), line, limits, known=(state.mean[best], state.covariance[best]))
     return (*fresh, _new_records(np.full(len(arc), np.log(elsewhere / max(len(arc), 1))), arc))

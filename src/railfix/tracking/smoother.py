@@ -136,7 +136,7 @@ def _ionosphere_m2(step: Step, h: int, vector: Floats, matrix: Floats, quiet_m: 
 
 
 def _arrange(later: BackwardInformation, satellite: Strings) -> tuple[Floats, Floats]:
-    """Return information vector and matrix in the order of given satellites; 0 for satellites missing in `later`."""
+    """Return information vector and matrix in the order of given satellites; 0 for satellites not in `later`."""
     _, here, there = np.intersect1d(satellite, later.satellite, return_indices=True)
     to = np.concatenate([np.arange(ix.SATELLITES), ix.SATELLITES + here])
     of = np.concatenate([np.arange(ix.SATELLITES), ix.SATELLITES + there])

@@ -155,7 +155,7 @@ def plot_service(service: pl.DataFrame, path: str | PathLike[str], *, title: str
 
 
 def _steps(service: pl.DataFrame, label: str, column: str, colour: str) -> Curve:
-    """Return a curve of a column that is constant in each stretch, with gaps where values are missing."""
+    """Return the curve of a column whose values are constant in each stretch, with gaps where values are missing."""
     begin, end = service["from_m"].to_numpy(), service["to_m"].to_numpy()
     value = service[column].cast(float).fill_null(float("nan")).to_numpy()
     value = np.where(np.isfinite(value), value, np.nan)

@@ -76,7 +76,7 @@ def screen_over_time(picture: ScreenPicture, time: Datetimes, *, epoch: NDArray[
 def screen_over_chainage(
     picture: ScreenPicture, chainage_m: Floats, *, epoch: NDArray[np.integer] | None = None
 ) -> Chart:
-    """Return the chart of `screen_over_time` over chainage [m], which has shape (T,), or (E,) with `epoch`."""
+    """Return the chart of `screen_over_time` over chainage [m], shape (T,), or (E,) if `epoch` is given."""
     return _screen(picture, chainage_m, epoch, None)
 
 
@@ -171,7 +171,7 @@ def _tightest(x: Floats, limit: Floats) -> tuple[Floats, Floats]:
 
 
 def draw_cn0_curve(path: str | PathLike[str], curve: Cn0Curve, samples: Cn0Samples) -> Path:
-    """Write a picture of C/N0 over elevation with mean and threshold (P1 figure 3), and return the path.
+    """Write a picture of C/N0, mean and threshold over elevation (P1 figure 3), and return the path.
 
     The picture has one panel per constellation and signal. Raise OutputError if the file cannot be written.
     """
@@ -240,7 +240,7 @@ def draw_run_screens(run: Path, out: Path) -> list[Path]:
 
 
 def missing_columns(positions: pl.DataFrame, observations: pl.LazyFrame) -> list[str]:
-    """Return the sorted names of the columns that the charts need and the tables lack; old tables may lack some."""
+    """Return the sorted names of the columns that the charts need, but the tables (of old versions) lack."""
     columns = [column for screen in SCREENS for column in screen.columns]
     missing = {"raim_statistic", *(c.name for c in columns if c.table == "positions")} - set(positions.columns)
     missing |= {c.name for c in columns if c.table == "observations"} - set(observations.collect_schema())
@@ -254,7 +254,7 @@ class RunScreen:
     antenna: str  #: ``front`` or ``rear``.
     name: str  #: Name of the plot of the screen, such as ``doppler``.
     picture: ScreenPicture  #: Metric and limit of the screen, with T rows (epochs or observations).
-    epoch: NDArray[np.int32] | None  #: Index of the epoch of each row, shape (T,); None if the rows are the epochs.
+    epoch: NDArray[np.int32] | None  #: Index of the epoch of each row, shape (T,); None if there is one row per epoch.
     epoch_time: Datetimes  #: Time of each epoch, shape (E,).
     epoch_chainage_m: Floats  #: Chainage of the position of each epoch, shape (E,); NaN without a position.
 

@@ -161,7 +161,7 @@ def sky_epochs(
     epochs: int = SKY_EPOCHS,
     title: str = "Sky",
 ) -> SkyEpochs:
-    """Return the satellites in view of one antenna at some epochs, for sky plots.
+    """Return the satellites that one antenna has in view at some epochs, for sky plots.
 
     At most `epochs` epochs are returned: up to half of them are from `wanted`, and the rest are evenly spaced. Each
     satellite has one row per epoch, with the signal that was selected for positioning.
