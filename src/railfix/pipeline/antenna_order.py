@@ -25,7 +25,7 @@ _LEAST_STRETCHES: Final = 4
 #: The antennas are in the wrong order if the front antenna is behind the rear antenna by more than this number of
 #: sigmas.
 _CERTAIN: Final = 5.0
-#: Smallest antenna distance at which the order is tested [m].
+#: The order is tested if the antenna distance is at least this [m].
 _LEAST_DISTANCE_M: Final = 0.5
 
 

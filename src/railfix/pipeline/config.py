@@ -211,7 +211,7 @@ class Config(ScreenSettings):
     #: others. `feature` is the position of a line feature that the inertial unit and the tachometer detect.
     filter_sources: tuple[FilterSource, ...] = FILTER_SOURCES
     tracking: TrackingLimits = TrackingLimits()  #: Process and measurement noise of the filter.
-    sensors: SensorLimits = SensorLimits()  #: Noise of the on-board sensors, and the tachometer's wheel.
+    sensors: SensorLimits = SensorLimits()  #: Noise of the on-board sensors, and data of the tachometer's wheel.
     clock_offsets: ClockOffsetLimits = ClockOffsetLimits()  #: Limits of the inter-system biases.
     single_point: SinglePointLimits = SinglePointLimits()  #: Limits of the 3-D positions of single epochs.
     section: SectionLimits = SectionLimits()  #: Limits of ambiguous sections.

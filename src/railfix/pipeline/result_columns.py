@@ -182,7 +182,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         *IN_SPACE,
         Column("n_used", "satellites used", dtype=pl.Int16()),
-        Column("n_rejected", "satellites with a pseudorange that were not used", dtype=pl.Int16()),
+        Column("n_rejected", "satellites that have a pseudorange but were not used", dtype=pl.Int16()),
         Column("noise_scale", "ratio of the receiver's noise to the noise assumed by the weights, as estimated so far"),
         Column(
             "raim_outcome",
@@ -192,7 +192,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "raim_statistic",
-            "sum of squared residuals before any exclusion, in noise variances (m^2 with the fixed limit)",
+            "sum of squared residuals before any exclusion / noise variance (with the fixed limit: the sum in m^2)",
             "raim.statistic",
         ),
         Column("raim_scale", "noise scale of the statistic, from consistent ranges of earlier epochs", "raim.scale"),
@@ -297,7 +297,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         Column("conventional_offset_m", "distance of the 3-D single point from the nearest point of the trajectory"),
         Column(
             "map_offset_across_m",
-            "mean offset of the 3-D positions of the last minutes to the right of the line, facing rising chainage",
+            "mean offset to the right of the line, facing rising chainage, of the 3-D positions of the last minutes",
             "map_offset.across_m",
         ),
         Column(
@@ -315,8 +315,8 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "interference",
-            "`none`, `jamming_suspected` or `spoofing_suspected`, even where the status differs; or another cause of "
-            "the signs of interference: `time_tags`, `left_map`, `contradicted`",
+            "`none`, `jamming_suspected`, `spoofing_suspected`, or another cause of the signs of interference: "
+            "`time_tags`, `left_map`, `contradicted`; the status may differ",
             "interference.suspicion",
             words=tuple(s.name.lower() for s in Suspicion),
         ),
@@ -354,7 +354,7 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
         Column("elevation_deg", "elevation of the satellite", "result.elevation_deg"),
         Column("azimuth_deg", "azimuth of the satellite, from north over east", "result.azimuth_deg"),
         Column("cn0_dbhz", "carrier-to-noise density", "result.cn0_dbhz"),
-        Column("sigma_m", "standard deviation of the pseudorange assumed by the weights", "result.sigma_m"),
+        Column("sigma_m", "standard deviation of the pseudorange, from which its weight is computed", "result.sigma_m"),
         Column(
             "corrected_code_m",
             "pseudorange corrected for satellite clock, group delay and atmosphere",
@@ -390,8 +390,8 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
         ),
         Column(
             "innovation_code_m",
-            "filter along the track: code minus the code predicted from earlier epochs, where codes are used (once per "
-            "second)",
+            "filter along the track: code minus the code predicted from earlier epochs; only at epochs whose codes "
+            "are used (one per second)",
             lambda o: o.innovation(Kind.CODE),
         ),
         *of_one_meaning(
@@ -401,7 +401,7 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
         ),
         Column(
             "weight_code",
-            "weight of the code in the filter; 1 for an error of one standard deviation",
+            "weight of the code in the filter; 1 if the error of the code is one standard deviation",
             lambda o: o.on_all_channels(None if o.tracked is None else o.tracked.tracked.weight[:, Kind.CODE]),
         ),
     )

@@ -202,7 +202,7 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         ),
         Column(
             "protection_level_ground_m",
-            "protection level of the straight distance to the train, valid also on another lap or off the map",
+            "protection level of the straight distance from position to train; also valid on other laps or off the map",
             "tracked.ground_level_m",
         ),
         Column("protection_noise_m", "part of the protection level for fault-free noise", "tracked.level_noise_m"),
@@ -214,8 +214,8 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         ),
         Column(
             "over_reading_m",
-            "largest distance of the train behind the position: the protection level, or 2 % of the distance "
-            "since codes were used, if larger (`L_DOUBTOVER` minus `Q_LOCACC`)",
+            "largest distance of the train behind the position: the larger of the protection level and 2 % of the "
+            "distance since codes were last used (`L_DOUBTOVER` minus `Q_LOCACC`)",
             "tracked.amount_m",
         ),
         Column("under_reading_m", "largest distance of the train ahead (`L_DOUBTUNDER`)", "tracked.amount_m"),
@@ -235,7 +235,7 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         *IN_SPACE,
         Column(
             "code_weight",
-            "mean weight of codes; 1 for an error of one standard deviation",
+            "mean weight of codes; a code has the weight 1 if its error is one standard deviation",
             "tracked.code_weight",
         ),
         Column("motion_weight", "mean weight of Dopplers and phases", "tracked.motion_weight"),
@@ -315,7 +315,7 @@ SMOOTHED_COLUMNS: Final[Mapping[str, Column[SmoothedAntenna]]] = by_name(
             lambda s: s.trajectory.chainage_at(on_line_m(s.track, s.trajectory)),
         ),
         Column("smoothed_sigma_m", "standard deviation of the smoothed chainage", "track.sigma_m"),
-        Column("smoothed_speed_mps", "speed along the line, from measurements before and after", "track.speed_mps"),
+        Column("smoothed_speed_mps", "speed along the line, from earlier and later measurements", "track.speed_mps"),
     )
 )
 

@@ -30,7 +30,7 @@ from railfix.pipeline.sensed_motion import CARRIED, REACH, SensedMotion, SensedS
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import RangeEpochs, SensorEpochs
 
-#: Longest interval between epochs for which a distance or a mean force is computed [s].
+#: No distance and no mean force is computed for longer intervals between epochs than this [s].
 _LONGEST_S: Final = 5.0
 #: Minimum fraction of an interval's samples that must be finite for a mean.
 _COMPLETE: Final = 0.9

@@ -48,7 +48,7 @@ class DopplerSpeedLimits(Settings):
     #: exceed it, the largest residual is rejected first.
     outlier: float = Field(default=3.5, gt=0)
     most_rejected: int = Field(default=8, ge=0)  #: Largest number of Dopplers rejected per epoch.
-    min_satellites: int = Field(default=4, ge=3)  #: Minimum number of Dopplers per epoch.
+    min_satellites: int = Field(default=4, ge=3)  #: Epochs with fewer Dopplers than this have no speed.
 
 
 @dataclass(frozen=True, kw_only=True)

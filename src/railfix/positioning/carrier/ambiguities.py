@@ -48,7 +48,7 @@ class PhaseLimits(Settings):
     integer_risk: float = Field(default=1e-4, gt=0, lt=0.5)
     #: Prior probability of non-integer phases (multipath, half cycles).
     no_integer_prior: float = Field(default=1e-2, gt=0, lt=1)
-    #: Largest noise sigma along the line. Epochs with a larger noise sigma have no position.
+    #: Epochs with a noise sigma along the line above this have no position.
     largest_sigma_m: float = Field(default=1e3, gt=0)
 
 

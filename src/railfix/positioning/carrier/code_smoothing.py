@@ -58,7 +58,7 @@ class CycleSlipLimits(Settings):
     (`continuity.track_jumps`) has no such limit.
     """
 
-    #: Longest interval across which an arc continues. Station logs have intervals of 30 s.
+    #: An arc ends at a longer interval than this. Station logs have intervals of 30 s.
     max_gap_s: float = Field(default=31.0, gt=0)
     #: Constant part of the Doppler test limit. For recorded data at 1 Hz, the median of phase change minus change
     #: predicted from Dopplers is 0.01 to 0.04 m.
@@ -66,7 +66,7 @@ class CycleSlipLimits(Settings):
     #: Part of the Doppler test limit that is proportional to the interval.
     doppler_mps: float = Field(default=0.05, gt=0)
     jerk_mps3: float = Field(default=0.5, gt=0)  #: Largest jerk of the antenna; passenger trains have less.
-    #: Limit of the change of code minus phase. This test is used without Dopplers, or if the Doppler limit is larger.
+    #: Limit of the change of code minus phase. Used if there is no Doppler or its limit is larger than this one.
     code_m: float = Field(default=10.0, gt=0)
 
 
