@@ -135,7 +135,7 @@ def check_corrections(config: Config, corrections: MessageCorrections | None) ->
         )
     if corrections is not None and corrections.dual_frequency != config.dual_frequency_sbas:
         used = "L5" if corrections.dual_frequency else "L1"
-        raise SettingsError(f"sbas_band = {config.sbas_band}, but the corrections are for SBAS on {used}; both must agree")
+        raise SettingsError(f"sbas_band = {config.sbas_band}, but the corrections are for SBAS on {used}; use one band")
 
 
 def receive(
