@@ -33,14 +33,14 @@ class RaimResult(NotebookTable):
     """Result of fault detection and exclusion at T epochs."""
 
     outcome: Codes  #: `raim.Outcome`, shape (T,).
-    #: Test statistic before any exclusion, shape (T,), in noise variances or, in mode "fixed", in m^2.
+    #: Test statistic before any exclusion, shape (T,), in units of the noise variance or, in mode "fixed", in m^2.
     statistic: Floats
     threshold: Floats  #: Threshold of the statistic, shape (T,); NaN where the epoch cannot be tested.
     scale: Floats  #: Noise scale used in the test of the residuals, shape (T,).
     excluded: Masks  #: True for excluded channels, shape (T, K).
     own_error_m: Floats  #: Range error of the faulty channels, shape (T, K); NaN for other channels.
-    #: Protection level of the remaining ranges (`raim.reliability`), shape (T,); infinite where a fault of one range is
-    #: undetectable. NaN without a position, with a remaining fault, or if RAIM or this level is switched off.
+    #: Position protection level from the remaining ranges (`raim.reliability`), shape (T,); infinite where a fault of
+    #: one range is undetectable. NaN without a position, with a remaining fault, or if RAIM or this level is off.
     protection_level_m: Floats
 
     @property
@@ -52,7 +52,7 @@ class RaimResult(NotebookTable):
 def compute_statistic(
     ranges: Ranges, fix: LineFix, scale: ArrayLike = 1.0, *, limits: RaimLimits | None = None
 ) -> RaimResult:
-    """Return the statistic of the residuals and its threshold (P4). No test is made: every outcome is UNTESTABLE."""
+    """Return the statistic of the residuals and its threshold (P4), not compared: every outcome is UNTESTABLE."""
     return _untested(_detect(fix, ranges.redundancy, scale, limits or RaimLimits()), ranges.weight.shape, scale)
 
 
@@ -85,9 +85,9 @@ def exclude_faults(
 
     The sum of squared residuals is compared with a chi-square threshold (P4, false-alarm probability 1e-3), or with 100
     m^2 (P1 table 6, mode "fixed"). Every satellite and then every pair is left out in turn (P1 2.3(4), see `exclude`).
-    In chi-square mode, a robust fit confirms the exclusion. A pair is not excluded if the robust fit keeps one of its
-    ranges, because other satellites may then be faulty. Where the fault remains unresolved, `RaimResult.faulty` is
-    True, and the position is computed from the ranges kept by the robust fit.
+    In chi-square mode, a robust fit must confirm the exclusion. If it keeps a range of a pair, the pair is not
+    excluded: other satellites may be faulty. Where the fault remains unresolved, `RaimResult.faulty` is True, and the
+    position is computed from the ranges kept by the robust fit.
 
     Parameters
     ----------
@@ -97,8 +97,8 @@ def exclude_faults(
     fix : LineFix
         Positions computed from these ranges (`fix_on_line`).
     scale : array_like, shape (T,) or ()
-        Ratio of the receiver's range standard deviation to the sigmas of the weights (`noise_scale`). Raise ValueError
-        if it is neither positive nor NaN.
+        Ratio of the receiver's range standard deviation to the standard deviation assumed in the weights
+        (`noise_scale`). Raise ValueError if it is neither positive nor NaN.
     agreeing : ndarray of bool, shape (T, M), optional
         Ranges kept by a robust fit on the line (`robust_fit`), by default computed by this function.
     model : LinearModel, optional
@@ -131,21 +131,21 @@ def exclude_faults(
         return ranges, fix, raim
     ranges = without(ranges, raim.excluded)
     fix = refit_epochs(ranges, antennas, fix, changed, fix_limits)
-    # After an exclusion, another section may fit best. The remaining ranges must also pass the test there.
+    # The remaining ranges may fit another section of the line best, and must pass the test there too.
     still = _detect(fix, ranges.redundancy, scale, limits).detected[changed]
     raim.outcome[changed[still]] = Outcome.UNRESOLVED
     return ranges, fix, raim
 
 
 def _put(raim: RaimResult, epochs: Indices, exclusion: Exclusion, rows: Indices | slice = slice(None)) -> None:
-    """Copy selected rows of an exclusion into the result; `epochs` are the epochs of all its rows."""
+    """Copy the rows `rows` of an exclusion into the result; `epochs` has the epoch of each row of the exclusion."""
     at = epochs[rows]
     for name in ("outcome", "excluded", "own_error_m"):
         getattr(raim, name)[at] = getattr(exclusion, name)[rows]
 
 
 def _by_robust_fit(raim: RaimResult, ranges: Ranges, agreeing: Masks, failing: Indices, min_redundancy: int) -> None:
-    """Exclude ranges rejected by the robust fit, where the fault is unresolved or the fit keeps a range of an excluded
+    """Exclude the ranges rejected by the robust fit if the fault is unresolved or this fit keeps a range of an excluded
     pair.
 
     No range is excluded where fewer than `min_redundancy` redundant ranges would remain.
@@ -172,10 +172,10 @@ def _second_attempt(
     limits: RaimLimits,
     fix_limits: FixLimits,
 ) -> Exclusion:
-    """Repeat the exclusion of unresolved epochs at the position computed without the worst channel.
+    """For epochs with an unresolved fault, repeat the exclusion at the position computed without the worst channel.
 
-    On a curve, a large fault moves the position to a part of the line with a different direction. A model that is
-    linearised there is not valid at the true position.
+    On a curve, a large fault moves the position to a part of the line with a different direction. A model linearised at
+    the wrong position is not valid at the true one.
     """
     worst = np.zeros((len(epochs), ranges.code_m.shape[1]), dtype=bool)
     worst[np.arange(len(epochs)), worst_channel(model)] = True

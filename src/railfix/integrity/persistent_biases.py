@@ -44,7 +44,7 @@ class LastingErrorLimits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class LastingErrorState:
-    """Mean residuals of one antenna after a chunk."""
+    """Mean residuals of one antenna at the end of a chunk."""
 
     #: Time of the last epoch, NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))

@@ -35,8 +35,8 @@ def _of_residuals(limits: SinglePointLimits) -> RaimLimits:
 def validate_point(point: SinglePoint, ranges: Ranges, noise_scale: Floats, *, limits: SinglePointLimits) -> Codes:
     """Return the `PointStatus` of each conventional position, shape (T,).
 
-    `noise_scale`, shape (T,), is the ratio of the receiver's range standard deviation to the sigmas of the weights. The
-    checks are the same as in pntpos.c (RTKLIB: `valsol`); one clock per constellation is assumed.
+    `noise_scale`, shape (T,), is the ratio of the receiver's range standard deviation to the standard deviation assumed
+    in the weights. The checks are the same as in pntpos.c (RTKLIB: `valsol`); one clock per constellation is assumed.
     """
     test = detect(
         point.wsse, point.residual_m, ranges.space_redundancy, scale=noise_scale,

@@ -114,7 +114,7 @@ class LocatedFeature:
     #: Standard deviation ``sqrt(S / integral (dq/ds)^2 ds)`` with the noise density S of the measured quantity q; NaN
     #: if the series does not determine the position better than the prediction.
     sigma_m: float
-    reason: str = ""  #: Reason if the position is not accepted.
+    reason: str = ""  #: Why the position is not accepted; empty if accepted.
 
 
 def locate(

@@ -43,14 +43,14 @@ class MotionState(IntEnum):
     EXPIRED = 7  #: The inertial speed is too old or implausible; there is no speed.
 
 
-#: Largest difference of the pitch sines of vehicle and line without a slip, equivalent to 0.15 m/s2.
+#: Larger differences of the pitch sines of vehicle and line indicate a slip; equivalent to 0.15 m/s2.
 _MAP_LIMIT: Final = 0.015
 #: Largest difference of the pitch sines in standard deviations while the wheel rolls; the larger limit is used. This
 #: limit is required because a pitching body accelerates an accelerometer that is mounted high.
 _NOISE_SIGMAS: Final = 5.0
 _NOISE_S: Final = 30.0  #: Time constant with which the standard deviation of the pitch sines is estimated.
 _LATCH_MPS: Final = 0.15  #: Largest difference of wheel and inertial speeds at which a slip can end.
-_LATCH_SHARE: Final = 0.01  #: As `_LATCH_MPS`, as a fraction of the speed; the larger limit is used.
+_LATCH_SHARE: Final = 0.01  #: As `_LATCH_MPS`, but a fraction of the speed; the larger of the two limits is used.
 _LATCH_S: Final = 0.5  #: Time for which the speeds must agree before a slip ends.
 #: The inertial speed of a slip starts this time plus `confirm_s` plus `SMOOTHING_S` before the slip is detected.
 LOOK_BACK_S: Final = 0.3
@@ -68,7 +68,7 @@ _FASTEST_MPS: Final = 100.0  #: Largest plausible inertial speed.
 _SETTLING_S: Final = 2.0
 _ROLLING_LIMIT: Final = 0.002  #: Change of the pitch sine since standstill that indicates rolling away.
 _ROLLING_S: Final = 0.3  #: Time for which a change must persist to indicate rolling away.
-_ROLLING_MPS: Final = 0.05  #: Inertial speed that a train rolling away must also exceed.
+_ROLLING_MPS: Final = 0.05  #: Rolling away is declared only if the inertial speed exceeds this.
 
 
 class SlipLimits(Settings):
@@ -257,7 +257,7 @@ class _Automaton:
         self._past.append((self._age, self.speed, inertial))
 
     def _pitch_rate(self, wheel: float, right: float, pitching: float, yawing: float) -> float:
-        """Return the rate of the pitch angle at a sample, during a slip computed with the inertial speed."""
+        """Return the rate of the pitch angle at a sample; during a slip, the inertial speed is used."""
         slips = self.state in (MotionState.INERTIAL_SPIN, MotionState.INERTIAL_SLIDE)
         speed = self.speed if slips or wheel != wheel else wheel
         lean = min(max(((speed if speed == speed else 0.0) * yawing - right) / GRAVITY_MPS2, -0.5), 0.5)

@@ -50,17 +50,17 @@ SEPARATE_CLOCKS_M: Final = 100.0
 class AntennaPairLimits(Settings):
     """Limits of the antenna-pair screen."""
 
-    #: Largest deviation of the pseudorange difference from the expected difference; 5 in P1 table 6.
+    #: Largest accepted deviation of the pseudorange difference from the expected difference; 5 in P1 table 6.
     limit_m: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
-    #: Error of a satellite's elevation relative to the car body; 3 in P1 2.3(3).
+    #: Largest assumed error of a satellite's elevation relative to the car body; 3 in P1 2.3(3).
     elevation_error_deg: float = Field(default=3.0, ge=0.0, le=90.0)
-    #: Error of a satellite's azimuth relative to the car body; 3.5 in P1 2.3(3).
+    #: Largest assumed error of a satellite's azimuth relative to the car body; 3.5 in P1 2.3(3).
     azimuth_error_deg: float = Field(default=3.5, ge=0.0, le=90.0)
-    #: Receiver clocks: one clock for both receivers ("common"), or the median eliminates their difference ("median").
+    #: Both receivers share one clock ("common"), or a median removes the difference of their clocks ("median").
     clocks: Literal["common", "median"] = "median"
     #: Minimum number of common satellites in a constellation, with clocks "median".
     least_satellites: int = Field(default=4, ge=3)
-    #: Largest difference between the time tags of two paired epochs.
+    #: Epochs are paired if their time tags differ by at most this.
     tag_tolerance_s: float = Field(default=0.01, ge=0.0, lt=1.0)
     #: Treatment of an inconsistent satellite: its sigma is increased ("weigh"), or it is rejected ("reject"), as in P1.
     #: Both antennas are treated alike, because the faulty antenna is unknown.
@@ -94,7 +94,7 @@ class Spacing(NamedTuple):
 class TagDifference(NamedTuple):
     """Difference between the time tags of the two receivers, with the range rates to correct for it."""
 
-    later: ArrayLike  #: Time tag of the rear minus the front receiver, timedelta64, shape (P,).
+    later: ArrayLike  #: Time tag of the rear receiver minus time tag of the front receiver, timedelta64, shape (P,).
     range_rate_mps: ArrayLike  #: Range rate ``-lambda D``, shape (P, C); NaN (unknown) counts as 0.
 
 

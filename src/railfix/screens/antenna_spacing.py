@@ -18,14 +18,14 @@ from railfix.screens.pairs import FilteredMotion, PairedEpochs, PositionScreen
 class AntennaSpacingLimits(Settings):
     """Limits of the antenna-spacing screen."""
 
-    #: Largest difference between the distance from one position to the other and the antenna spacing; 5 in P1 table 6.
+    #: Largest accepted difference between the distance of the two positions and the antenna spacing; 5 in P1 table 6.
     limit_m: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
     #: A difference of filter positions or speeds is rejected only if it exceeds this number of standard deviations, in
     #: addition to the limit in m or m/s. The standard deviations grow when the filter predicts over a gap.
     filter_sigmas: float = Field(default=4.0, gt=0.0, allow_inf_nan=False)
     #: Largest difference of the two antennas' filter speeds. Antennas on one vehicle differ in speed by a few cm/s at
-    #: most, where the track curves or its cant changes. A smaller difference at a single epoch changes a position by
-    #: less than 1 m.
+    #: most, where the track curves or its cant changes. A difference below the limit at a single epoch changes a
+    #: position by less than 1 m.
     filter_speed_mps: float = Field(default=1.5, gt=0.0)
     #: Time after a rejection for which neither filter position is used. A wrong speed causes a wrong position, which
     #: pseudoranges correct within about 20 s.

@@ -36,7 +36,7 @@ class Verdict:
     """A screen's result on the channels of one antenna."""
 
     name: str  #: Key in `AntennaResult.screens`: name of the screen, or of one of several verdicts of the screen.
-    reason: Reason  #: Reason that rejected observations get.
+    reason: Reason  #: Rejection reason of the observations that the screen rejects.
     screened: Screened  #: Metric and verdict, shape (T, M).
     #: Measured error that increases the sigma of a suspected range; None to reject the range; shape (T, M).
     error_m: Floats | None = None
@@ -68,7 +68,7 @@ class ScreenSetup:
 class ScreenColumn:
     """Column of the result tables that a screen fills."""
 
-    name: str  #: Name, ending with the unit: ``metric_doppler_m``.
+    name: str  #: Name of the column, ending with the unit: ``metric_doppler_m``.
     meaning: str
     verdict: str  #: Key of the verdict in `AntennaResult.screens`.
     field: str = "metric"  #: Name of the array in `Verdict.screened` that fills the column.
@@ -96,8 +96,8 @@ class ObservationPicture(NamedTuple):
     title: str
     label: str
     metric: str  #: Column of the observations.
-    reason: Reason  #: Reason of the rejected observations.
-    limit: str  #: Field of the screen's limits (if it is None, there is no picture), or column of the observations.
+    reason: Reason  #: Rejection reason of the observations drawn as rejected.
+    limit: str  #: Name of a field of the screen's limits (if it is None, no picture), or of an observation column.
     sides: Literal["both", "above", "below"] = "both"
 
 

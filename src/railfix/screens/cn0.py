@@ -31,7 +31,7 @@ from railfix.screens.base import (
 class Cn0Limits(Settings):
     """Limits of the C/N0 screen."""
 
-    #: Largest deficit of C/N0 from the open-sky mean at the same elevation; 10 in P1 table 6. None disables the test.
+    #: Largest accepted deficit of C/N0 below the open-sky mean at the same elevation; 10 in P1 table 6. None: no test.
     deficit_dbhz: float | None = Field(default=10.0, gt=0.0, allow_inf_nan=False)
     #: Minimum C/N0; with None, the default, there is no floor. P1 table 6 uses 30 for its receivers. Receivers measure
     #: C/N0 differently: 30 rejects over half of an M8T's signals in a city, where 20 to 25 is suitable.
@@ -42,8 +42,8 @@ class Cn0Limits(Settings):
 class Cn0Screened(Screened):
     """Verdict of the C/N0 screen; the metric is C/N0, and the limit is the higher of the two limits [dB-Hz]."""
 
-    floor: Screened  #: Verdict of the floor; the metric is C/N0 [dB-Hz].
-    #: Verdict of the curve; the metric is the mean minus the measured C/N0 [dB], NaN where the mean is unknown.
+    floor: Screened  #: Verdict of the comparison with the floor; the metric is C/N0 [dB-Hz].
+    #: Comparison with the curve; the metric is the mean minus the measured C/N0 [dB], NaN for an unknown mean.
     curve: Screened
 
 
@@ -93,7 +93,7 @@ def cn0_screen(
 
 
 class Cn0Screen(ObservationScreen[Cn0Limits]):
-    """Screen of C/N0, with an absolute floor and an open-sky curve over elevation."""
+    """Screen of C/N0, with an absolute floor and a curve of the open-sky mean over elevation."""
 
     name = "cn0"
     limits = Cn0Limits()

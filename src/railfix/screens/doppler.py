@@ -2,15 +2,15 @@
 
 A pseudorange has jumped if its change differs from the change computed from the Dopplers at both epochs. A constant
 multipath error is not detected. A step of the receiver clock changes all pseudoranges equally, and is removed by
-subtraction of the median over a constellation. The interval is first corrected for the clock step: at a range rate of
-800 m/s, a step of 4 ms changes the range by 3.2 m.
+subtraction of the median over a constellation. Before that, the interval between the epochs is corrected for the clock
+step: at a range rate of 800 m/s, a step of 4 ms changes the range by 3.2 m.
 
 P1 uses epochs 0.1 s apart. Over longer intervals the limit grows with the uncorrelated part of the pseudorange noise,
 ``sqrt(1 - exp(-dt / correlation_s))``, and the change of acceleration, ``jerk dt^3 / 12``. The limit has three modes,
 and is never smaller than P1's limit. In mode "fixed" it is P1's limit. In mode "receiver" it is `factor` times the
 noise scale of the receiver, estimated from its pseudorange changes. In mode "sigma" it is `factor` times the standard
 deviation of each pseudorange change, with the Doppler noise ``sigma dt`` included. In urban recordings at 1 Hz the mode
-"sigma" detects a quarter of the faulty pseudoranges, and rejects the same fraction of fault-free pseudoranges.
+"sigma" rejects a quarter of the faulty and a quarter of the fault-free pseudoranges.
 """
 
 from __future__ import annotations
@@ -43,8 +43,7 @@ class DopplerLimits(Settings):
 
     #: How the limit is determined: fixed as in P1, scaled by the receiver's noise, or scaled by the pseudorange sigmas.
     mode: Literal["fixed", "receiver", "sigma"] = "receiver"
-    #: Largest deviation of a pseudorange change from its Doppler-derived value up to `short_interval_s`; P1 table 6:
-    #: 1.5.
+    #: Largest accepted pseudorange change minus Doppler-derived change, up to `short_interval_s`; P1 table 6: 1.5.
     step_m: float = Field(default=1.5, gt=0.0, allow_inf_nan=False)
     #: Interval up to which the limit is constant. The default allows for one lost epoch at P1's interval of 0.1 s.
     short_interval_s: float = Field(default=0.2, gt=0.0, allow_inf_nan=False)
@@ -52,7 +51,7 @@ class DopplerLimits(Settings):
     correlation_s: float = Field(default=1.0, gt=0.0, allow_inf_nan=False)
     #: Largest jerk of the vehicle [m/s^3]; trains stay below 1.
     jerk_mps3: float = Field(default=1.0, ge=0.0, allow_inf_nan=False)
-    #: Limit in standard deviations, for modes "receiver" and "sigma".
+    #: Ratio of the limit to the noise, for modes "receiver" and "sigma".
     factor: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
     #: Standard deviation of a range rate from the Doppler, for mode "sigma".
     doppler_sigma_mps: float = Field(default=0.1, ge=0.0, allow_inf_nan=False)
@@ -63,7 +62,8 @@ class DopplerLimits(Settings):
     #: Longest time for which a satellite remains suspected after a jump. With 0, only the epochs of the jump and of the
     #: jump back are affected, as in P1.
     hold_s: float = Field(default=2.0, ge=0.0, allow_inf_nan=False)
-    least_satellites: int = Field(default=3, ge=3)  #: Fewest satellites with the same receiver clock for a test.
+    #: Minimum number of satellites with the same receiver clock for a test.
+    least_satellites: int = Field(default=3, ge=3)
     #: Treatment of a suspected satellite: its sigma is increased ("weigh"), or it is rejected ("reject"), as in P1. The
     #: increase follows from the size of the jump (`railfix.screens.suspicion_sigma_m`). With few satellites, a
     #: rejection can weaken the geometry so much that a position error grows from a few metres to a hundred metres.
@@ -154,7 +154,7 @@ class DopplerState:
     #: Time of the jump; NaT where the satellite is not suspected.
     since: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))
     scale_sum: float = 0.0  #: Sum of the logarithms of the epochs' noise scales (mode "receiver").
-    scale_epochs: float = 0.0  #: Number of epochs in this sum.
+    scale_epochs: float = 0.0  #: Number of epochs in `scale_sum`.
 
     def __post_init__(self) -> None:
         freeze_arrays(self)

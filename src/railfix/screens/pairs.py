@@ -87,13 +87,13 @@ def pair_antennas(
 class PairedEpochs:
     """P common epochs of two antennas of one vehicle."""
 
-    #: Indices of matching epochs of each antenna, shape (P,).
+    #: For each antenna, indices of its paired epochs, shape (P,).
     front_epoch: Indices
     rear_epoch: Indices
     #: Approximate positions of the antennas on their trajectories, shape (P, 3).
     front_ecef_m: Floats
     rear_ecef_m: Floats
-    #: Chainage of the front minus the rear antenna; negative if the vehicle faces falling chainage; shape (P,).
+    #: Front antenna's chainage minus rear antenna's; negative if the vehicle faces falling chainage; shape (P,).
     along_m: Floats
 
 

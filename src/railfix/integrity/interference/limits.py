@@ -44,7 +44,7 @@ class Sign(IntFlag):
     RECEIVER_SPOOFING = 1 << 3
     #: All satellites have the same C/N0, which is typical of a single transmitter.
     EQUAL_CN0 = 1 << 4
-    #: The code ranges of all satellites step relative to their Dopplers, or the clock drift jumps.
+    #: The code ranges of all satellites jump without a Doppler that explains it, or the clock drift jumps.
     CLOCK_JUMP = 1 << 5
     #: The 3-D velocity changes faster than a train can.
     SPEED_JUMP = 1 << 6
@@ -78,10 +78,10 @@ class InterferenceLimits(Settings):
 
     use: Literal["on", "off"] = "on"
     least_satellites: int = Field(default=6, ge=5)  #: Minimum number of satellites in a comparison of satellites.
-    #: Minimum fall of C/N0 below its recent peak (median over all satellites) that counts as a sign.
+    #: Falls of C/N0 below its recent peak count as a sign if their median over all satellites is at least this.
     fall_db: float = Field(default=5.0, gt=0)
-    #: Largest standard deviation, over the satellites, of the C/N0 falls caused by jamming. A jammer raises the noise
-    #: of all channels equally; walls and roofs do not.
+    #: Largest standard deviation, over the satellites, of C/N0 falls that are attributed to jamming. A jammer raises
+    #: the noise of all channels equally; walls and roofs do not.
     spread_db: float = Field(default=1.5, gt=0)
     peak_decay_db_per_min: float = Field(default=1.0, gt=0)  #: Decay rate of each satellite's C/N0 peak.
     known_after_s: float = Field(default=10.0, ge=0)  #: Tracking time from which a satellite's C/N0 is used.
@@ -91,8 +91,8 @@ class InterferenceLimits(Settings):
     #: Largest standard deviation, over the satellites, of C/N0 values that count as equal. On the test recordings, this
     #: standard deviation is at least 1.2 dB.
     equal_db: float = Field(default=0.8, gt=0)
-    #: Minimum step of the codes relative to the Dopplers that counts as a sign, after removal of whole milliseconds.
-    #: Phone clocks step by 30 m without interference.
+    #: Minimum jump of the codes relative to the Dopplers, without whole milliseconds, that counts as a sign. Phone
+    #: clocks step by 30 m without interference.
     clock_jump_m: float = Field(default=60.0, gt=0)
     drift_jump_mps: float = Field(default=10.0, gt=0)  #: Minimum jump of the clock drift that counts as a sign.
     speed_jump_mps: float = Field(default=5.0, gt=0)  #: Minimum jump of the 3-D velocity that counts as a sign.
@@ -102,20 +102,20 @@ class InterferenceLimits(Settings):
     #: Minimum estimated time-tag error that counts as a sign. For correct time tags, the estimated error reaches 0.05 s
     #: in towns, and 0.13 s with a phone and seven satellites.
     tag_error_s: float = Field(default=0.1, gt=0)
-    tag_sigmas: float = Field(default=6.0, gt=0)  #: Minimum estimated time-tag error in standard deviations.
-    #: Time for which all positions must fail a check to be a sign of interference.
+    tag_sigmas: float = Field(default=6.0, gt=0)  #: As `tag_error_s`, in sigmas of the error.
+    #: If all positions fail a check for this time, this counts as a sign of interference.
     contradicted_s: float = Field(default=60.0, gt=0)
     #: Minimum jump of clock drift, velocity and position in standard deviations. The same minimum applies to the
     #: distance from the line, after `position_jump_m` is subtracted.
     jump_sigmas: float = Field(default=10.0, gt=0)
     #: Minimum difference, in standard deviations, between the positions and clocks of two constellations.
     part_sigmas: float = Field(default=15.0, gt=0)
-    #: Largest acceleration of a train. Only the part of a change that exceeds this acceleration counts as a jump.
+    #: Largest acceleration of a train. Only the part of a change that this acceleration cannot explain is a jump.
     acceleration_mps2: float = Field(default=2.0, gt=0)
     max_speed_mps: float = Field(default=100.0, gt=0)  #: Largest speed of a train.
     longest_gap_s: float = Field(default=10.0, gt=0)  #: Largest interval between two epochs that are compared.
-    largest_speed_sigma_mps: float = Field(default=2.0, gt=0)  #: Largest standard deviation of a compared velocity.
-    largest_sigma_m: float = Field(default=30.0, gt=0)  #: Largest standard deviation of a compared position.
+    largest_speed_sigma_mps: float = Field(default=2.0, gt=0)  #: Velocities with a larger sigma are not compared.
+    largest_sigma_m: float = Field(default=30.0, gt=0)  #: Positions with a larger sigma are not compared.
     #: Time for which a fall of C/N0 or gain, equal C/N0, or a position off the map must persist to be a sign.
     hold_s: float = Field(default=3.0, gt=0)
     part_hold_s: float = Field(default=10.0, gt=0)  #: Time for which two constellations must differ.
@@ -123,13 +123,13 @@ class InterferenceLimits(Settings):
     wheel_window_s: float = Field(default=120.0, gt=0)
     wheel_least_s: float = Field(default=60.0, gt=0)  #: Minimum length of a window that begins at a slip or a data gap.
     wheel_m: float = Field(default=20.0, gt=0)  #: Minimum difference of GNSS and wheel distance that is a sign.
-    wheel_sigmas: float = Field(default=6.0, gt=0)  #: Minimum of this difference in standard deviations.
+    wheel_sigmas: float = Field(default=6.0, gt=0)  #: As `wheel_m`, in sigmas of the difference.
     #: Whether the filter's protection level covers spoofing that slowly shifts the position along the track and that
     #: the comparison with the wheel has not detected yet. With "on", the protection level is two to four times as
     #: large.
     wheel_level: Literal["on", "off"] = "off"
-    #: With `wheel_level` on, the level is at least the distance difference plus this number of its standard deviations.
-    #: The default assumes a probability of 1e-7 that spoofing has begun within the window, and a risk of 1e-9.
+    #: With `wheel_level` on, the level is at least the GNSS-wheel distance difference plus this number of its sigmas.
+    #: The default is for a probability of 1e-7 that spoofing began within the window and an integrity risk of 1e-9.
     wheel_level_sigmas: float = Field(default=2.1, ge=0)
     #: Relative standard deviation of the wheel circumference before its estimation from positions.
     wheel_scale: float = Field(default=0.01, gt=0)
@@ -173,7 +173,7 @@ _NEVER: Final = np.datetime64("NaT", "ns")
 
 @dataclass(frozen=True, kw_only=True)
 class HeldState:
-    """State of C conditions with holding and release times after a chunk."""
+    """State, at the end of a chunk, of C conditions that have holding and release times."""
 
     time: np.datetime64 = field(default_factory=lambda: _NEVER)  #: Time of the last epoch; NaT before the first.
     #: Time for which each condition has been continuously true, shape (C,).
@@ -210,23 +210,23 @@ def hold_signs(
 
 _MINUTE_S: Final = 60.0
 _GAIN_DECAY_PER_MIN: Final = 0.005  #: Relative decay of the gain peak per minute.
-_LARGEST_DBHZ: Final = 100.0  #: A peak that has decayed by this much is dropped [dB].
+_LARGEST_DBHZ: Final = 100.0  #: Decay after which a peak is dropped [dB].
 _LONGEST_SILENCE_S: Final = 60.0  #: Longest gap within a satellite's tracking [s].
 
 
 @dataclass(frozen=True, kw_only=True)
 class PowerState:
-    """State of C/N0 and front-end gain after a chunk."""
+    """State of the C/N0 and gain statistics at the end of a chunk."""
 
     #: Satellite and signal, such as "G011C"; shape (K,).
     channel: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U5"))
-    #: C/N0 peak plus the decay from the GPS epoch to the peak, shape (K,); -inf before the first observation.
+    #: C/N0 peak plus decay rate times time of the peak since the GPS epoch, shape (K,); -inf if never observed.
     peak_db: Floats = field(default_factory=lambda: np.zeros(0))
     #: Start of each channel's current tracking, in seconds since the GPS epoch, shape (K,); NaN if never tracked.
     first_s: Floats = field(default_factory=lambda: np.zeros(0))
     #: Last observation of each channel, in seconds since the GPS epoch, shape (K,); NaN if never observed.
     last_s: Floats = field(default_factory=lambda: np.zeros(0))
-    gain: float = -np.inf  #: Peak of the logarithmic gain plus the decay from the GPS epoch to the peak.
+    gain: float = -np.inf  #: Logarithmic gain peak plus decay rate times time of the peak since the GPS epoch.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -234,7 +234,7 @@ class PowerSigns:
     """C/N0 and gain statistics of T epochs. The C/N0 statistics are NaN where too few satellites are available."""
 
     fall_db: Floats  #: Median, over the satellites, of the fall of C/N0 below the recent peak, shape (T,).
-    spread_db: Floats  #: Standard deviation of the falls over the satellites, shape (T,).
+    spread_db: Floats  #: Standard deviation, over the satellites, of the falls, shape (T,).
     difference_db: Floats  #: Standard deviation of C/N0 over the satellites, shape (T,).
     #: Fall of the gain as a fraction of its recent peak, shape (T,); NaN where the receiver does not report the gain.
     gain_fall: Floats

@@ -48,12 +48,12 @@ def _no_fix() -> Fix:
 
 @dataclass(frozen=True, kw_only=True)
 class MotionSignState:
-    """State of the motion tests after a chunk."""
+    """State of the motion tests at the end of a chunk."""
 
     #: Time of the last epoch; NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     channel: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U5"))  #: Satellite and signal, shape (K,).
-    code_m: Floats = field(default_factory=lambda: np.zeros(0))  #: Last code of each channel, shape (K,).
+    code_m: Floats = field(default_factory=lambda: np.zeros(0))  #: Last code range of each channel, shape (K,).
     #: Last range rate (``-lambda D``) of each channel, shape (K,).
     rate_mps: Floats = field(default_factory=lambda: np.zeros(0))
     #: Time of the last code and range rate of each channel, shape (K,).
@@ -168,7 +168,7 @@ def _length(covariance: Floats) -> Floats:
 
 
 def _before(fixes: Fix, start: Fix, good: Masks) -> tuple[Fix, Fix]:
-    """Return the last `good` fix before each epoch, and the last `good` fix of the chunk; by default `start`."""
+    """Return the last `good` fix before each epoch, and the last `good` fix of the chunk; `start` if there is none."""
     if len(good) == 1:
         return start, fixes if good[0] else start
     time, *numbers = (np.concatenate([a, b]) for a, b in zip(start, fixes, strict=True))

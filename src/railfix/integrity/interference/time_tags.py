@@ -26,7 +26,7 @@ _SETTLED_S: Final = 0.05  #: Change of the time-tag error below which the iterat
 _SETTLED_M: Final = 100.0  #: Change of the position below which the iteration ends [m].
 _ROUNDS: Final = 2  #: Number of reweighted fits per iteration.
 _FITS_WELL: Final = 3.0  #: Residuals up to this multiple of their median have full weight.
-_SHOWN: Final = 3.0  #: Time-tag errors above this many standard deviations are fitted again with the line.
+_SHOWN: Final = 3.0  #: Time-tag errors above this many sigmas are fitted again, constrained to the line.
 _NEAR_LINE_M: Final = 20.0  #: Standard deviation of the line constraint, lateral and vertical [m].
 _LEAST_FREEDOM: Final = 3  #: Minimum redundancy of the rows that agree with a time-tag error.
 #: Residuals below this many standard deviations agree with a fit. The cost function clips residuals at this limit.
@@ -63,8 +63,8 @@ def fit_time_tags(inputs: MotionInputs) -> tuple[Floats, Floats]:
 
     The fit includes satellites that were rejected as faulty, because a time-tag error makes satellites appear faulty.
     If the error is significant or the position doubtful, the fit is repeated with the line as a constraint and compared
-    with a fit without a time-tag error and rejected satellites. If the time-tag error does not explain the residuals
-    clearly better, its standard deviation is infinite. Both values are NaN where undetermined.
+    with a fit that has no time-tag error and leaves out rejected satellites. If the time-tag error does not explain the
+    residuals clearly better, its standard deviation is infinite. Both values are NaN where undetermined.
     """
     near, every = inputs.near_ecef_m, inputs.used | inputs.named
     error, sigma, place, _ = _fit(inputs, every, np.zeros(len(near)), near, tags=True, line=False)

@@ -35,13 +35,13 @@ class WheelSamples(RowArrays):
     #: Largest part of the distance since the start that `distance_m` may lack, because tachometers have no output at
     #: low speed.
     doubt_m: Floats = field(default_factory=lambda: np.empty(0))
-    #: Number of the part of the run. Within a part, the wheel data have neither slip nor a gap.
+    #: Index of the part of the run. Within a part, the wheel data have neither slip nor a gap.
     part: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
 
 @dataclass(frozen=True, kw_only=True)
 class WheelState:
-    """State of the comparison after a chunk."""
+    """State of the comparison at the end of a chunk."""
 
     #: First sample of the current part, and the samples of the last window.
     samples: WheelSamples = field(default_factory=WheelSamples)
@@ -150,7 +150,7 @@ def _compare(
     long_enough = time[now] - time[begun] >= limits.wheel_least_s - 0.5
 
     def apart(a: Integers, b: Integers) -> tuple[Floats, Floats, Floats]:
-        """Return GNSS minus wheel distance, wheel distance, and the variance of the former without `sigma_m[b]`."""
+        """Return GNSS minus wheel distance, wheel distance, and the variance of the difference without `sigma_m[b]`."""
         arc, distance = samples.arc_m[b] - samples.arc_m[a], samples.distance_m[b] - samples.distance_m[a]
         if not signed:
             arc, distance = np.abs(arc), np.abs(distance)

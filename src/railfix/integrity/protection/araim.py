@@ -51,8 +51,8 @@ class AraimBudget(Settings):
     false_alarm_along: float = Field(default=3.9e-6, gt=0, lt=1)
     false_alarm_vertical: float = Field(default=3.9e-6, gt=0, lt=1)
     false_alarm_horizontal: float = Field(default=9e-8, gt=0, lt=1)
-    #: Largest total probability of faults that are not modes. The number of simultaneous faults in a mode is increased,
-    #: up to `most_faults`, until this limit is met.
+    #: Largest total probability of faults that no mode covers. The number of simultaneous faults in a mode is
+    #: increased, up to `most_faults`, until this limit is met.
     unmonitored: float = Field(default=8e-8, gt=0, lt=1)
     most_faults: int = Field(default=2, ge=1, le=3)  #: Largest number of simultaneous faults in a mode.
     map_prior: float = Field(default=1e-4, ge=0, lt=1)  #: Prior probability of a wrong map; 0 omits this mode.
@@ -82,13 +82,13 @@ class AraimGeometry:
 class AraimLevels:
     """Protection levels of T epochs for Q position components."""
 
-    #: Protection levels, shape (T, Q); NaN without a position. A level is infinite where unmonitored faults are more
-    #: probable than the risk, or above 10 km.
+    #: Protection levels, shape (T, Q); NaN without a position. A level is infinite if it would exceed 10 km or if the
+    #: probability of unmonitored faults exceeds the risk.
     level_m: Floats
     sigma_int_m: Floats  #: Integrity standard deviations of the position from all observations, shape (T, Q).
     sigma_acc_m: Floats  #: Accuracy standard deviations of the position from all observations, shape (T, Q).
     modes: Integers  #: Number of fault modes, shape (T,).
-    unmonitored: Floats  #: Probability of faults that are not modes or prevent a position, shape (T,).
+    unmonitored: Floats  #: Probability of faults that no mode covers or that prevent a position, shape (T,).
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)

@@ -1,8 +1,8 @@
 """Integrity risk of a protection level, and allocation of this risk to fault hypotheses.
 
 The risk per hour (1e-7 in P1 2.4 and RTCA DO-229D) is divided by the number of independent samples in an hour. The risk
-of a sample, minus the probability of faults that are not hypotheses, is allocated to the hypotheses. A hypothesis is a
-set of faults: shared faults (of a constellation, of the map, or of the low satellites on one side of the track) and
+of a sample, minus the probability of faults that no hypothesis covers, is allocated to the hypotheses. A hypothesis is
+a set of faults: shared faults (of a constellation, of the map, or of the low satellites on one side of the track) and
 faults of single satellites. Hypotheses with equal shared faults and equal numbers of single satellites form a class.
 """
 
@@ -65,13 +65,13 @@ class RiskBudget(Settings):
     #: at standstill, SBAS corrections within minutes (DO-229D appendix J: 10 samples per hour). A larger number is
     #: conservative: the fault-free K for 3600 samples is 0.9 larger than for 10.
     samples_per_hour: float = Field(default=360.0, gt=0, allow_inf_nan=False)
-    #: Fractions of an epoch's risk for the level parts for no, one and two faults; their sum is at most 1. The level is
-    #: lowered from the largest part until the sum of all tail probabilities equals the risk of all parts. Doubling a
+    #: Fractions of an epoch's risk for no, one and two faults; their sum is at most 1. A level is computed for each.
+    #: The largest is lowered until the sum of all tail probabilities equals the sum of the three risks. Doubling a
     #: fraction lowers a K of 6 by only 0.1 and a K of 3 by only 0.2, so the defaults are equal.
     fault_free_share: float = Field(default=1.0 / 3.0, gt=0)
     one_fault_share: float = Field(default=1.0 / 3.0, gt=0)
     two_fault_share: float = Field(default=1.0 / 3.0, gt=0)
-    #: Fraction of the risk for faults that are not hypotheses. If these faults are more probable, more faults become
+    #: Fraction of the risk for faults that no hypothesis covers. If their probability exceeds it, more faults become
     #: hypotheses, with up to four satellites and three shared faults (constellation, side, map) at the same time.
     unchecked_share: float = Field(default=0.3, gt=0, lt=1)
     #: Fraction of the risk for epochs with one excluded satellite, and equally for epochs with two.
@@ -208,7 +208,7 @@ class Allocation:
     members: Masks  # (T, B, M) satellites affected by each set of shared faults
     shared_prior: Floats  # (T, B) probability of each set of shared faults; 0 if too few of its satellites are used
     order: Indices  # (T, B) largest number of satellites that are faulty in addition to each set; -1: no hypothesis
-    beyond: Floats  # (T,) probability of the classes that are not hypotheses
+    beyond: Floats  # (T,) probability of the classes without a hypothesis
     fault_free: Floats  # (T,) risk allocated to no fault
     one: Floats  # (T,) risk allocated to one fault
     two: Floats  # (T,) risk allocated to two faults
@@ -222,11 +222,11 @@ def allocate(
 ) -> Allocation:
     """Choose the fault hypotheses of each epoch and divide the risk among them.
 
-    A single satellite, a side, and a constellation or the map (alone and with one satellite) are always hypotheses.
-    Pairs of satellites are hypotheses where they are more probable than the risk allocated to two faults. The most
-    probable other classes are added until the remaining classes are within the risk for unchecked faults. `out`, shape
-    (T,), is the number of excluded satellites. `sides`, shape (T, S, M), are the sets of satellites that may be faulty
-    together.
+    Faults of one satellite, a side, a constellation and the map are always hypotheses, the last two also together with
+    one faulty satellite. Pairs of satellites are hypotheses where their probability exceeds the risk allocated to two
+    faults. The most probable other classes are added until the remaining classes are within the risk for unchecked
+    faults. `out`, shape (T,), is the number of excluded satellites. `sides`, shape (T, S, M), are the sets of
+    satellites that may be faulty together.
     """
     used = model.used
     sides = sides & used[:, None]
@@ -298,7 +298,7 @@ def _allocate(
     )
     beyond = classes.rest(order)
     left = risk.sample_risk(n, out, beyond)
-    # Where they exist, hypotheses of three or more faults have a quarter of each part's risk.
+    # Hypotheses of three or more faults, if there are any, take a quarter of the risk of each other part.
     more = (order + [s.kind for s in shared] >= 3).any(axis=1, where=order >= 0)
     left = np.where(more, 0.75, 1.0) * left
     parts = [s * left for s in (risk.fault_free_share, risk.one_fault_share, risk.two_fault_share)]
@@ -348,9 +348,9 @@ class _Classes:
         return replace(self, each=self.each[rows], sums=self.sums[rows], further=self.further[rows])
 
     def rest(self, order: Indices) -> Floats:
-        """Return the probability of faults that are not hypotheses, shape (T,).
+        """Return the probability of faults that no hypothesis covers, shape (T,).
 
-        If a set of shared faults is not a hypothesis, its probability includes all its supersets.
+        The probability of a set of shared faults without a hypothesis already includes all supersets of the set.
         """
         whole = (order < 0) & (self.each > 0.0)
         covered = whole.astype(np.float64) @ self.within.T > 0.0

@@ -46,9 +46,9 @@ class Cause(IntEnum):
     ONE_FAULT = 1
     #: Two simultaneous faults.
     TWO_FAULTS = 2
-    #: Infinite level: undetectable satellite faults are more probable than the risk allocated to them.
+    #: Infinite level: the probability of undetectable satellite faults exceeds the risk allocated to them.
     UNCHECKED = 3
-    #: Infinite level: faults that are not hypotheses are more probable than the risk, or too many satellites are
+    #: Infinite level: the probability of faults that no hypothesis covers exceeds the risk, or too many satellites are
     #: excluded.
     BUDGET = 4
     #: No position.
@@ -74,7 +74,7 @@ class ProtectionLevel(NotebookTable):
     #: Protection level, shape (T,), at which the tail probabilities add up to at most the risk. If infinite, see
     #: `cause`.
     level_m: Floats
-    #: Level parts for no fault, one fault and two faults, shape (T,). A part is 0 if the total probability of its
+    #: Separate levels for no fault, one fault and two faults, shape (T,). A part is 0 if the total probability of its
     #: hypotheses is within the risk allocated to it.
     fault_free_m: Floats
     one_fault_m: Floats
@@ -93,7 +93,7 @@ class ProtectionLevel(NotebookTable):
     worst_two: Indices  #: Channels whose faults determine `two_fault_m`, shape (T, 2); -1 if other faults do.
     #: Constellation whose fault determines `one_fault_m`, shape (T,); empty if another fault does.
     worst_constellation: Strings
-    unchecked_risk: Floats  #: Probability of faults that are not hypotheses, subtracted from the risk, shape (T,).
+    unchecked_risk: Floats  #: Probability of faults that no hypothesis covers, subtracted from the risk, shape (T,).
     cause: Codes  #: `Cause` of each epoch, shape (T,).
 
 
@@ -252,7 +252,7 @@ class _Names(NamedTuple):
 
     asked: Asked
     share: Floats  # (T, 4) risk for no fault, one, two, and more faults
-    letters: Strings  # constellation letters of single faults, numbered after the n channels; else empty
+    letters: Strings  # letters of constellations with a single-fault hypothesis, numbered after the n channels
     pairs: Indices  # (K, 2) pairs of channels; the last entry is (-1, -1)
 
 

@@ -23,7 +23,7 @@ from railfix.core.constants import LEAST_REDUNDANCY
 from railfix.integrity.raim.exclusion import RaimLimits
 from railfix.integrity.raim.position_model import LinearModel, compact
 
-#: Effects of a range on the position up to this number of position sigmas count as zero.
+#: An effect of a range on the position counts as zero if it is at most this number of position sigmas.
 _NO_EFFECT: Final = 1e-6
 _BLOCK_SIZE: Final = 40_000  #: Largest number of elements of a block's array of channel pairs.
 

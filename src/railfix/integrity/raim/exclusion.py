@@ -41,12 +41,12 @@ class RaimLimits(Settings):
     #: Largest number of satellites excluded at an epoch; 2 in P1 2.3(4).
     max_excluded: int = Field(default=2, ge=0, le=2)
     min_redundancy: int = Field(default=1, ge=1)  #: Minimum degrees of freedom after an exclusion.
-    #: Probability that noise alone makes the correct exclusion fit worse than a competing exclusion by the separation
-    #: (chi-square, one degree of freedom). An epoch is inseparable if another exclusion of as many satellites passes
-    #: and its WSSE is larger by less than the separation.
+    #: Probability that noise alone makes the WSSE of the correct exclusion exceed the WSSE of a competing exclusion by
+    #: more than the separation (chi-square, one degree of freedom). An epoch is inseparable if another exclusion of as
+    #: many satellites passes and its WSSE is larger by less than the separation.
     separation_risk: float = Field(default=1e-3, gt=0, le=1)
     #: Exclusions do not compete if their positions are closer than this distance, because the choice hardly changes the
-    #: position (for example with the two satellites of a separate clock). With 0, exclusions always compete.
+    #: position (for example, between two satellites that alone share a clock). With 0, exclusions always compete.
     same_position_m: float = Field(default=0.0, ge=0)
     #: Two-sided probability that the position noise exceeds the noise part K sigma of the protection level. A value of
     #: 1 means K = 0, as in ``HSlope sigma0 sqrt(lambda)`` of P4.
@@ -68,7 +68,7 @@ class RaimLimits(Settings):
 
     @cached_property
     def own_error(self) -> float:
-        """Smallest squared normalised error of an excluded satellite."""
+        """Satellites with a smaller squared normalised error are not excluded."""
         return float(scipy.special.chdtri(1, self.false_alarm))
 
 
@@ -108,7 +108,7 @@ def detect(
     freedom : array_like of int, shape (T,)
         Ranges minus unknowns: ``ranges.n_used - ranges.n_clocks - 1`` on the line, with ``- 3`` in space.
     scale : array_like, shape (T,) or ()
-        Ratio of the receiver's range standard deviation to the sigmas of the weights. Not used in fixed mode.
+        Ratio of the receiver's range sigma to the range sigma assumed in the weights. Not used in fixed mode.
     """
     limits = limits or RaimLimits()
     freedom = np.asarray(freedom, dtype=np.int64)
@@ -170,7 +170,7 @@ class Outcome(IntEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class Exclusion:
-    """Exclusions of T epochs by M channels."""
+    """Result of the exclusion of satellites at T epochs with M channels."""
 
     outcome: Codes  #: `Outcome`, shape (T,).
     excluded: Masks  #: True for excluded channels, shape (T, M).
