@@ -30,7 +30,7 @@ _LEAST_DISTANCE_M: Final = 0.5
 
 
 class AntennaOrder:
-    """Mean distance of the front antenna ahead of the rear antenna on one track, from their positions.
+    """Mean distance by which the front antenna is ahead of the rear antenna, from positions on the same track.
 
     `distance_m` is the distance of the front antenna ahead of the rear antenna according to the vehicle file [m].
     Epochs of the two antennas are paired if their time tags differ by at most `tolerance_s`.

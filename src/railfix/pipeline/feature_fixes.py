@@ -36,7 +36,7 @@ class LineFeatures:
     series: LineSeries
     features: tuple[Feature, ...]
     antenna_m: Floats  #: Arc lengths of the vertices of the antenna's trajectory, shape (V,).
-    body_m: Floats  #: Arc lengths on the line of the body's middle when the antenna is at each vertex, shape (V,).
+    body_m: Floats  #: Arc length of the body's middle on the line when the antenna is at each vertex, shape (V,).
     line: Line  #: The line itself, for distances that may cross the join of a closed line.
 
     @classmethod

@@ -43,9 +43,9 @@ _CONTRADICTED: Final = int(
 )
 #: Rejection reasons that indicate individual errors of satellites, provided that only few satellites have them.
 _WRONG_ALONE: Final = int(Reason.FAULT_EXCLUDED | Reason.LASTING_ERROR | Reason.GROSS_ERROR)
-#: Largest number of satellites with individual errors; a spoofer with a consistent position affects more satellites.
+#: Errors of more satellites than this are not individual errors; a spoofer with a consistent position affects more.
 _MOST_WRONG: Final = 2
-#: Largest number of satellites of one clock with individual gross errors.
+#: Gross errors of more satellites of one clock than this are not individual errors.
 _MOST_GROSS: Final = 4
 _NOT_ITS_SIGNAL: Final = int(Reason.OTHER_SIGNAL_TAKEN)
 #: Position statuses that are replaced if spoofing is suspected.

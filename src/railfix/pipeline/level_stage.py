@@ -283,7 +283,7 @@ def compute_araim(
 
 
 def _sight(corrected: CorrectedRanges, place: Floats) -> tuple[Floats, Floats, Masks]:
-    """Return unit vectors (T, M, 3) and clock columns (M, G) of M channels used at any epoch, and their mask (K,)."""
+    """Return unit vectors (T, M, 3) and clock columns (M, G) of M channels that are ever used, and a mask (K,)."""
     channels = (corrected.reason == 0).any(axis=0)
     to_satellite = corrected.satellites.position_ecef_m[:, channels] - place[:, None, :]
     distance = np.linalg.norm(to_satellite, axis=2, keepdims=True)
@@ -293,7 +293,7 @@ def _sight(corrected: CorrectedRanges, place: Floats) -> tuple[Floats, Floats, M
 
 
 def _rotate_geometry(geometry: AraimGeometry, axes: Floats) -> AraimGeometry:
-    """Return the geometry rotated to other position axes, given as rows of shape (T, 3, 3)."""
+    """Return the geometry rotated to other position axes: the rows of `axes`, shape (T, 3, 3)."""
     design = geometry.design.copy()
     design[..., :_SPACE] = design[..., :_SPACE] @ axes.swapaxes(1, 2)
     return copy_with(geometry, design=design)

@@ -165,7 +165,7 @@ def tie_constellations(
     states : sequence of OffsetState
         State of each receiver after the previous chunk.
     reference : str, optional
-        Letter of the reference clock of all biases; by default the GPS clock, or the first clock without GPS.
+        Letter of the reference clock of all biases; by default the GPS clock or, if GPS is not used, the first clock.
     parts : sequence of slice
         Epochs of each receiver.
     limits : TieLimits, optional

@@ -34,9 +34,9 @@ class NoiseScaleLimits(Settings):
     #: infinity, the scale is always the prior scale.
     prior: float = Field(default=20.0, gt=0)
     least_epochs: float = Field(default=20.0, ge=1)  #: Minimum window length in epochs.
-    #: Weight of the window's variance in the variance of an epoch, in degrees of freedom. The variance of an epoch also
-    #: includes the epoch's squared residuals, because the noise varies more between epochs than chi-square predicts.
-    #: The default is the number of degrees of freedom of Student's t for recorded code errors.
+    #: Degrees of freedom with which the variance of the window enters the variance of an epoch. The variance of an
+    #: epoch also includes the epoch's squared residuals, because the noise varies more between epochs than chi-square
+    #: predicts. The default is the number of degrees of freedom of Student's t for recorded code errors.
     spread: float = Field(default=4.0, gt=0)
 
 

@@ -47,7 +47,7 @@ class SearchIndex:
         return self.trajectory.nearest(self.trajectory.ecef_m)[0]
 
     def clear_of_tangent_m(self, arc_m: Floats) -> Floats:
-        """Return a horizontal radius around each position within which the line is on its tangent, shape (T,) [m].
+        """Return the horizontal radius around each position in which line and tangent coincide, shape (T,) [m].
 
         The radius is at most `CLEAR_M` and is valid for all positions on a section.
         """

@@ -96,7 +96,7 @@ class ContinuityLimits(Settings):
     """Limits of the phase jump test."""
 
     phase_m: float = Field(default=0.012, gt=0)  #: Constant part of the standard deviation of a phase change.
-    #: Part of the standard deviation of a phase change proportional to the interval (satellite clocks, delays).
+    #: Part, proportional to the interval, of the standard deviation of a phase change (satellite clocks, delays).
     drift_mps: float = Field(default=0.008, gt=0)
     #: Constant part of the standard deviation of lateral and vertical motion, due to errors of map points.
     aside_m: float = Field(default=0.02, gt=0)
