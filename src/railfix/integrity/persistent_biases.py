@@ -83,9 +83,9 @@ def reject_persistent_biases(
 ) -> tuple[Ranges, PersistentBiases, list[LastingErrorState]]:
     """Reject satellites with persistent code errors; return the remaining ranges, new positions and new states.
 
-    An error of twice the noise passes the single-epoch test of P4. The clipped residuals are therefore averaged over
-    time. The satellite with the largest mean is rejected first. Then the positions are computed again, and their
-    residuals determine the next satellite.
+    A range error of twice the noise sigma passes the single-epoch test of P4. The clipped residuals are therefore
+    averaged over time. The satellite with the largest mean is rejected first. Then the positions are computed again,
+    and the next satellite is chosen from the new residuals.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def reject_persistent_biases(
 
 
 def _find_worst(mean: Floats, used: Masks, share: float) -> Masks:
-    """Return a mask (T, K) of the used range with the largest absolute mean of each epoch, if it exceeds `share`."""
+    """Return a mask (T, K) of each epoch's used range with the largest absolute mean, if this mean exceeds `share`."""
     found = np.zeros_like(used)
     if mean.shape[1]:
         rows, worst = np.arange(len(mean)), np.abs(np.where(used, mean, 0.0)).argmax(axis=1)

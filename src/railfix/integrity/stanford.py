@@ -45,7 +45,7 @@ class Continuity:
 
     window_s: float  #: Length of the windows.
     windows: int  #: Number of windows that end within the run.
-    kept: int  #: Number of windows without unavailable epochs and gaps.
+    kept: int  #: Number of windows with neither unavailable epochs nor gaps.
     probability: float  #: Ratio kept / windows; NaN without windows.
 
 

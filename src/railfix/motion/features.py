@@ -29,11 +29,11 @@ _GAP_SIGMAS: Final = 3.0  #: Largest error of the wheel distance since the last 
 _FIT_LIMIT: Final = 3.0  #: Largest mean squared residual of the second quantity, in units of its variance.
 SCALE_SIGMA: Final = 2e-3  #: Relative standard deviation of a distance from wheel pulses.
 STEP_M: Final = 1.0  #: Spacing of the series along the line.
-HALF_LENGTH_M: Final = 60.0  #: Length of line before and after a feature that is compared.
+HALF_LENGTH_M: Final = 60.0  #: Length of the line compared before a feature, and after it.
 #: Changes below this fraction of a larger change within `HALF_LENGTH_M` are ignored, because the curvature of a line
 #: through sparse points has ripples.
 _RIPPLE: Final = 0.2
-#: Length over which a change is computed: about the distance of a vehicle's bogies, which smooth shorter changes.
+#: Length over which a change is computed: about the distance between a vehicle's bogies, which smooth shorter changes.
 BASE_M: Final = 15.0
 
 
@@ -82,7 +82,7 @@ def map_features(series: LineSeries, *, least: Mapping[Quantity, Floats] | None 
     """Find the largest changes of gradient and of curvature over `BASE_M`, in the order of their arc lengths.
 
     The position of a feature is the middle of its change. For a measured line, `least` has a bound per point and
-    quantity, shape (N,). A change is then ignored below the root sum of squares of the bounds at its two ends.
+    quantity, shape (N,). A change is then ignored if it is below the root sum of squares of the bounds at its two ends.
     """
     reach, around_steps = 2 * max(round(BASE_M / STEP_M), 1), round(HALF_LENGTH_M / STEP_M)
     found: list[Feature] = []

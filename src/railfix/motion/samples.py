@@ -118,8 +118,8 @@ class SensorSamples:
     radar: RadarSpeeds = field(default_factory=RadarSpeeds)
     ranging: StationRanges = field(default_factory=StationRanges)
     balises: BaliseReadings = field(default_factory=BaliseReadings)
-    #: Sensors whose samples up to the epoch have not arrived in live positioning. Their values since the previous epoch
-    #: are unknown, but may arrive with the next epoch.
+    #: In live positioning, sensors whose samples up to the epoch have not arrived. Their values since the previous
+    #: epoch are unknown, but may arrive with the next epoch.
     silent: frozenset[str] = frozenset()
 
     @property

@@ -35,11 +35,11 @@ class MotionState(IntEnum):
 
     INIT = 0  #: Not yet initialised; there is no speed.
     STANDING = 1  #: At rest: there was no pulse for a second, and the inertial speed is small.
-    LOW_SPEED = 2  #: The train moves too slowly for the tachometer; the speed is inertial.
+    LOW_SPEED = 2  #: The train moves too slowly for the tachometer; the inertial speed is used.
     NORMAL = 3  #: The wheel rolls without slip; the speed is the wheel speed.
-    INERTIAL_SPIN = 4  #: The wheel is faster than the train; the speed is inertial.
-    INERTIAL_SLIDE = 5  #: The wheel is slower than the train; the speed is inertial.
-    ROLLING = 6  #: The train rolls away from rest, too slowly for the tachometer; the speed is inertial.
+    INERTIAL_SPIN = 4  #: The wheel is faster than the train; the inertial speed is used.
+    INERTIAL_SLIDE = 5  #: The wheel is slower than the train; the inertial speed is used.
+    ROLLING = 6  #: The train rolls away from rest, too slowly for the tachometer; the inertial speed is used.
     EXPIRED = 7  #: The inertial speed is too old or implausible; there is no speed.
 
 
@@ -54,12 +54,12 @@ _LATCH_SHARE: Final = 0.01  #: As `_LATCH_MPS`, but a fraction of the speed; the
 _LATCH_S: Final = 0.5  #: Time for which the speeds must agree before a slip ends.
 #: The inertial speed of a slip starts this time plus `confirm_s` plus `SMOOTHING_S` before the slip is detected.
 LOOK_BACK_S: Final = 0.3
-#: Longest use of an inertial speed, whose assumed drift `carry_drift_mps2` then amounts to 0.3 m/s.
+#: Longest use of an inertial speed; with the assumed drift `carry_drift_mps2`, its error is then 0.3 m/s.
 _LONGEST_CARRY_S: Final = 30.0
 #: Time constant of the low-pass filter of the pitch. It suppresses pitching of the body (about 1 Hz) and vibration.
 SMOOTHING_S: Final = 0.2
-_STANDING_S: Final = 1.0  #: Time without a pulse after which the vehicle is assumed at rest.
-_STANDING_MPS: Final = 0.5  #: Largest inertial speed at which a train without pulses is assumed at rest.
+_STANDING_S: Final = 1.0  #: Time without a pulse after which the vehicle is assumed to be at rest.
+_STANDING_MPS: Final = 0.5  #: Largest inertial speed at which a train without pulses is assumed to be at rest.
 _PITCH_S: Final = 20.0  #: Time constant of the correction of a pitch integrated from the gyro.
 #: Largest plausible sine of the pitch from wheel and accelerometer: 0.035 for the line, and a margin.
 _STEEPEST: Final = 0.1
@@ -387,7 +387,7 @@ class _Automaton:
                 self._rest += min(dt / limits.offset_s, 1.0) * change
                 self.speed = 0.0
                 return
-            # A freely rolling train has no forward force, so that the change since standstill equals its acceleration.
+            # On a freely rolling train, the forward force is 0: its change since standstill equals the acceleration.
             self.speed += change * dt
             if self._apart >= _ROLLING_S and abs(self.speed) > _ROLLING_MPS:
                 self.state = MotionState.ROLLING

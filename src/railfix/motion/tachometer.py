@@ -123,7 +123,7 @@ def tooth_faults(pulses: TachometerPulses) -> tuple[Masks, Masks]:
     """Return masks of the pulses that follow a lost pulse, and of doubled pulses, shape (P,) each.
 
     A pulse is lost in an interval twice as long as both neighbouring intervals, or where `pulse` numbers are missing. A
-    pulse is doubled if the two intervals at it together equal each of the neighbouring intervals.
+    pulse is doubled if the sum of the intervals before and after it equals each neighbouring interval.
     """
     count = len(pulses)
     lost, doubled = np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)

@@ -4,7 +4,7 @@ The range from the rear antenna to a satellite is longer by ``L (cos el cos(az -
 gradient)``, with L the antenna spacing. A deviation from this difference indicates multipath at one of the two
 antennas, but not at which one.
 
-If `clocks` is "common", the receivers must share a clock: at epochs where the median difference exceeds
+If `clocks` is "common", the receivers must share a clock: at epochs where the median pseudorange difference exceeds
 `SEPARATE_CLOCKS_M`, no satellite is tested (P1 6). If `clocks` is "median", the clock difference is estimated by the
 median over the satellites of a constellation. If range rates are given, the satellites' motion between the two time
 tags is removed (0.8 m in 1 ms at most).
@@ -79,7 +79,7 @@ class AntennaPairScreened(Screened):
 
     @cached_property
     def ambiguity_m(self) -> Floats:
-        """Largest effect of the angle errors [m], shape (P, C); metrics up to this effect are not rejected."""
+        """Largest effect of the angle errors [m], shape (P, C); satellites with a smaller metric are not rejected."""
         return self.zone()
 
 
@@ -92,7 +92,7 @@ class Spacing(NamedTuple):
 
 
 class TagDifference(NamedTuple):
-    """Difference between the time tags of the two receivers, with the range rates to correct for it."""
+    """Difference between the time tags of the two receivers, and the range rates that correct pseudoranges for it."""
 
     later: ArrayLike  #: Time tag of the rear receiver minus time tag of the front receiver, timedelta64, shape (P,).
     range_rate_mps: ArrayLike  #: Range rate ``-lambda D``, shape (P, C); NaN (unknown) counts as 0.
@@ -105,7 +105,7 @@ def spacing_direction(front_ecef_m: ArrayLike, rear_ecef_m: ArrayLike) -> Spacin
     ----------
     front_ecef_m, rear_ecef_m : array_like, shape (P, 3) [m]
         Antenna positions on their trajectories at the same instant. Only the difference of the two positions is used,
-        so that an error of both positions has no effect on a straight line.
+        so that, on a straight line, a common error of both positions has no effect.
     """
     front, rear = np.asarray(front_ecef_m, dtype=np.float64), np.asarray(rear_ecef_m, dtype=np.float64)
     latitude, longitude, _ = geodetic_from_ecef((front + rear) / 2.0)

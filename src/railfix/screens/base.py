@@ -66,7 +66,7 @@ class ScreenSetup:
 
 @dataclass(frozen=True, kw_only=True)
 class ScreenColumn:
-    """Column of the result tables that a screen fills."""
+    """Column that a screen fills in the result tables."""
 
     name: str  #: Name of the column, ending with the unit: ``metric_doppler_m``.
     meaning: str

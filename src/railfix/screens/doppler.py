@@ -5,8 +5,8 @@ multipath error is not detected. A step of the receiver clock changes all pseudo
 subtraction of the median over a constellation. Before that, the interval between the epochs is corrected for the clock
 step: at a range rate of 800 m/s, a step of 4 ms changes the range by 3.2 m.
 
-P1 uses epochs 0.1 s apart. Over longer intervals the limit grows with the uncorrelated part of the pseudorange noise,
-``sqrt(1 - exp(-dt / correlation_s))``, and the change of acceleration, ``jerk dt^3 / 12``. The limit has three modes,
+P1 uses epochs 0.1 s apart. Over longer intervals the limit grows, because the uncorrelated part of the noise grows as
+``sqrt(1 - exp(-dt / correlation_s))``, and a change of acceleration adds ``jerk dt^3 / 12``. The limit has three modes,
 and is never smaller than P1's limit. In mode "fixed" it is P1's limit. In mode "receiver" it is `factor` times the
 noise scale of the receiver, estimated from its pseudorange changes. In mode "sigma" it is `factor` times the standard
 deviation of each pseudorange change, with the Doppler noise ``sigma dt`` included. In urban recordings at 1 Hz the mode
@@ -107,7 +107,7 @@ def expected_limit_m(interval_s: Floats, sigma_m: Floats, *, limits: DopplerLimi
 def receiver_limit_m(
     interval_s: Floats, metric_m: Floats, sum_log: float, weight: float, *, limits: DopplerLimits
 ) -> tuple[Floats, float, float]:
-    """Return the limit of mode "receiver", shape (T,) [m], and the sum and number of the logarithmic noise scales.
+    """Return the limit of mode "receiver", shape (T,) [m], and sum and number of the logarithms of noise scales.
 
     The noise scale of an epoch is the median over the satellites of the absolute metric, scaled to `short_interval_s`.
     The logarithms of the scales are averaged over the epochs, so that an epoch with large multipath errors does not
@@ -185,10 +185,10 @@ def doppler_screen(
     receiver clock (GPS and QZSS share a clock).
 
     A single difference does not show which of its two epochs is faulty. A satellite whose metric exceeds the limit is
-    suspected and rejected, and the metric is summed over the following epochs to an offset. As soon as the offset is
-    within the limit, the satellite is used again, although the jump back exceeds the limit. If the offset does not
-    return within `hold_s`, the new pseudorange is accepted. A temporary reflection is therefore rejected only while it
-    lasts. When a reflection that was present from the first epoch ends, good epochs are rejected for `hold_s`.
+    suspected and rejected, and its offset is the sum of the metric over the following epochs. As soon as the offset is
+    within the limit, the satellite is used again, although the jump back exceeds the limit. If the offset is not within
+    the limit after `hold_s`, the new pseudorange is accepted. A temporary reflection is therefore rejected only while
+    it lasts. When a reflection that was present from the first epoch ends, good epochs are rejected for `hold_s`.
 
     Parameters
     ----------
@@ -283,7 +283,7 @@ def _jumps(change: Floats, rate: Floats, interval: Floats, satellite: Strings, *
 def _limit_m(
     interval: Floats, metric: Floats, sigmas: Floats, before: DopplerState, limits: DopplerLimits
 ) -> tuple[Floats, float, float]:
-    """Return the limit, shape (T, M) or (T, 1) [m], and the sum and number of the logarithmic noise scales."""
+    """Return the limit, shape (T, M) or (T, 1) [m], and sum and number of the logarithms of noise scales."""
     total, epochs = before.scale_sum, before.scale_epochs
     if limits.mode == "sigma":
         return expected_limit_m(interval, sigmas, limits=limits), total, epochs

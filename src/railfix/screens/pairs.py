@@ -114,7 +114,7 @@ class PairScreen(_OfTwoAntennas[Limits]):
     def judge(
         self, front: AntennaRanges, rear: AntennaRanges, pair: PairedEpochs, limits: Limits
     ) -> Mapping[str, tuple[Verdict, ...]]:
-        """Return the verdicts on a chunk by antenna, "front" and "rear"."""
+        """Return the verdicts on a chunk for each antenna, "front" and "rear"."""
 
 
 class FilteredMotion(NamedTuple):

@@ -1,4 +1,4 @@
-"""Name, settings and picture of the screen `raim`; the pipeline itself runs RAIM, on the computed positions."""
+"""Name, settings and picture of the screen `raim`; the pipeline runs RAIM when it computes positions."""
 
 from __future__ import annotations
 

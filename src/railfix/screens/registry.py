@@ -27,7 +27,7 @@ def _rank(screen: Screen[Any]) -> int:
 
 
 def _find_installed() -> list[Screen[Any]]:
-    """Load the screens of installed packages; SettingsError if an object is not a screen, or if its name is taken."""
+    """Load the screens of installed packages; raise SettingsError if an object is no screen or its name is taken."""
     found: list[Screen[Any]] = []
     for entry in sorted(entry_points(group=GROUP), key=lambda entry: entry.name):
         package = entry.dist.name if entry.dist else "?"

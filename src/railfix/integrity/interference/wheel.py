@@ -32,8 +32,8 @@ class WheelSamples(RowArrays):
     arc_m: Floats = field(default_factory=lambda: np.empty(0))  #: GNSS position along the line.
     sigma_m: Floats = field(default_factory=lambda: np.empty(0))  #: Standard deviation of the GNSS position.
     distance_m: Floats = field(default_factory=lambda: np.empty(0))  #: Wheel distance since the start of the run.
-    #: Largest part of the distance since the start that `distance_m` may lack, because tachometers have no output at
-    #: low speed.
+    #: Largest distance since the start that may be missing from `distance_m`, because tachometers have no output at low
+    #: speed.
     doubt_m: Floats = field(default_factory=lambda: np.empty(0))
     #: Index of the part of the run. Within a part, the wheel data have neither slip nor a gap.
     part: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))

@@ -42,10 +42,10 @@ class Forms(NamedTuple):
     widest_m2: Floats  # (T, K) trace of the inverse matrix, an upper bound on its largest eigenvalue
 
     def radius_m(self, risk: float) -> Floats:
-        """Return the search radius of each hypothesis, shape (T, K); 0 for a hypothesis without a prior.
+        """Return the search radius of each hypothesis, shape (T, K); 0 for a hypothesis whose prior is 0.
 
-        True positions outside the radii have at most 1 % of the risk, divided equally among the hypotheses. A radius is
-        at most 5 km.
+        The true position is outside the radii with at most 1 % of the risk, divided equally among hypotheses. A radius
+        is at most 5 km.
         """
         possible = self.prior > 0
         each = _NEGLIGIBLE * risk / np.maximum(np.count_nonzero(possible, axis=1, keepdims=True), 1)
@@ -69,11 +69,11 @@ def places_beyond_the_level(
 ) -> Masks:
     """Return True for epochs whose protection level does not cover a possible position on the line, shape (T,).
 
-    Under a hypothesis J, let the sum of squared residuals of a position exceed the minimum by x variances. This
+    Under a hypothesis J, let the sum of squared residuals of a position exceed its minimum by x noise variances. This
     position is the true position with a probability of at most ``Q(sqrt(x))``. For each hypothesis, this probability is
-    computed for the best position beyond the protection level and multiplied by the prior of J. The result is True
-    where the sum over the hypotheses exceeds the risk of a sample. A `scale` below 1 counts as 1. `sides`, shape (T, S,
-    M), marks the low satellites of each side of the track.
+    computed for the position beyond the protection level that fits best, and multiplied by the prior of J. The result
+    is True where the sum over the hypotheses exceeds the risk of a sample. A `scale` below 1 counts as 1. `sides`,
+    shape (T, S, M), marks the low satellites of each side of the track.
     """
     result = np.zeros(len(arc_m), dtype=bool)
     rows = (np.isfinite(level_m) & np.isfinite(arc_m) & np.isfinite(model.wsse)).nonzero()[0]

@@ -344,7 +344,7 @@ def _names(plan: Allocation, rows: Indices, n: int) -> _Names:
 
 
 def _channels(channel: Indices, place: Indices) -> Indices:
-    """Return the channels at indices among the used channels, shape (T, k); -1 for an index of -1."""
+    """Convert indices among the used channels to channel numbers, shape (T, k); -1 remains -1."""
     return np.where(place >= 0, channel[np.arange(len(channel))[:, None], np.maximum(place, 0)], -1)
 
 

@@ -32,7 +32,7 @@ _BLOCK_SIZE: Final = 40_000  #: Largest number of elements of a block's array of
 class Reliability:
     """Reliability of the chi-square test at T epochs with M channels."""
 
-    noncentrality: Floats  #: Noncentrality lambda of each epoch's missed fault, shape (T,); NaN if not testable.
+    noncentrality: Floats  #: Noncentrality lambda of the smallest detectable fault, shape (T,); NaN if not testable.
     #: Range error that the test misses with the probability `missed_detection`, shape (T, M); infinite for ranges that
     #: no other range tests, NaN for unused ranges.
     minimal_detectable_bias_m: Floats
@@ -43,7 +43,7 @@ class Reliability:
     worst: Indices  #: Channel with the largest `slope_m`, shape (T,); -1 if all slopes are NaN.
     #: Position standard deviation, shape (T,): along the line, or along the major axis of the horizontal ellipse.
     position_sigma_m: Floats
-    #: Position error caused by the missed fault: largest slope times sqrt(lambda), shape (T,).
+    #: Position error caused by a fault of noncentrality lambda: largest slope times sqrt(lambda), shape (T,).
     fault_level_m: Floats
     noise_level_m: Floats  #: Noise part of the protection level: K sigma, shape (T,).
     #: Sum of fault and noise level, shape (T,); infinite where a fault is undetectable, NaN without a position.

@@ -63,12 +63,12 @@ class RaimLimits(Settings):
 
     @cached_property
     def separation(self) -> float:
-        """Minimum difference between the WSSE of an exclusion and of a competing exclusion, in noise variances."""
+        """Minimum difference between the WSSEs of two competing exclusions, in noise variances."""
         return float(scipy.special.chdtri(1, self.separation_risk))
 
     @cached_property
     def own_error(self) -> float:
-        """Satellites with a smaller squared normalised error are not excluded."""
+        """Squared normalised error below which a satellite is not excluded."""
         return float(scipy.special.chdtri(1, self.false_alarm))
 
 
@@ -106,7 +106,7 @@ def detect(
         error, `Constrained.residual_m` does not. They are equal only for an exact map (sigma of a millimetre), as in
         P1.
     freedom : array_like of int, shape (T,)
-        Ranges minus unknowns: ``ranges.n_used - ranges.n_clocks - 1`` on the line, with ``- 3`` in space.
+        Ranges minus unknowns: ``ranges.n_used - ranges.n_clocks - 1`` on the line, ``- 3`` instead of ``- 1`` in space.
     scale : array_like, shape (T,) or ()
         Ratio of the receiver's range sigma to the range sigma assumed in the weights. Not used in fixed mode.
     """
@@ -154,7 +154,7 @@ _BLOCK_SIZE: Final = 40_000
 class Outcome(IntEnum):
     """Result of fault detection and exclusion at an epoch."""
 
-    #: The residuals are within the noise.
+    #: The test statistic is within its threshold.
     PASSED = 0
     #: One satellite is excluded, and the remaining satellites pass.
     EXCLUDED_ONE = 1
@@ -174,13 +174,13 @@ class Exclusion:
 
     outcome: Codes  #: `Outcome`, shape (T,).
     excluded: Masks  #: True for excluded channels, shape (T, M).
-    #: Passing subset with the smallest statistic, even if INSEPARABLE: channels, shape (T, 2); -1 for none.
+    #: Channels of the passing exclusion with the smallest statistic, shape (T, 2), even if INSEPARABLE; -1: none.
     best: Indices
-    #: Next passing subset of as many channels, the closest competing exclusion: shape (T, 2); -1 for none.
+    #: Channels of the closest competing exclusion, of as many channels, shape (T, 2); -1 for none.
     alternative: Indices
     #: Range error of each channel of `best`, positive if the range is too long, shape (T, M); NaN for other channels.
     own_error_m: Floats
-    #: Test statistic without the channels of `best`, shape (T,), or of all channels where no subset passes.
+    #: Test statistic without the channels of `best`, or with all channels where no subset passes, shape (T,).
     statistic_after: Floats
     #: Position change caused by leaving out `best`, shape (T, k); 0 where no subset passes. The components are along
     #: the line (k = 1), or east and north (k = 2).

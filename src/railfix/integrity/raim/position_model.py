@@ -1,8 +1,8 @@
 """Linear model of the ranges for RAIM, on the line and in space.
 
-P4 tests the residuals of ``y = H x + v``. Here, every range is divided by its sigma. The receiver clocks and the
-lateral and vertical map errors, which have a prior, are eliminated. The residual projector is ``S = I - R K R^T - B Q
-B^T``. R has 1/sigma in the column of the satellite's clock, K is the clock covariance at a known position, B is the
+P4 tests the residuals of ``y = H x + v``. Here, every range is divided by its sigma. The receiver clocks are
+eliminated, and the lateral and vertical map errors, which have a prior. The residual projector is ``S = I - R K R^T - B
+Q B^T``. R has 1/sigma in the column of the satellite's clock, K is the clock covariance at a known position, B is the
 design without the clocks, and Q is the position covariance. The residuals are ``nu = S y``, and ``WSSE = y^T S y`` is
 chi-square distributed with `LinearModel.freedom` degrees of freedom.
 """
@@ -40,7 +40,7 @@ _BY_EPOCH: Final = ("root_weight", "clock_covariance_m2", "design", "covariance_
 
 @dataclass(frozen=True, kw_only=True)
 class LinearModel:
-    """Whitened ranges of T epochs by M channels, linearised at a position.
+    """Whitened ranges of M channels at T epochs, linearised at one position per epoch.
 
     The three position unknowns are along, across and up on the line, or east, north and up in space. The first
     `interest` unknowns are the components of interest.
@@ -52,7 +52,7 @@ class LinearModel:
     #: Design B: derivatives of the whitened ranges with respect to the position, with the clocks eliminated, shape (T,
     #: M, 3) [1/m]; 0 for unused ranges.
     design: Floats
-    #: Position covariance Q with the prior, shape (T, 3, 3); NaN where the position is undetermined.
+    #: Position covariance Q, computed with the prior, shape (T, 3, 3); NaN where the position is undetermined.
     covariance_m2: Floats
     prior: Floats  #: Prior information P on the position, from the map sigmas, shape (3, 3) [1/m^2].
     #: Whitened code minus distance (y), which contains the clock, shape (T, M); 0 for unused ranges.
@@ -132,8 +132,8 @@ class LinearModel:
     def position_covariance_m2(self, scale: Floats) -> Floats:
         """Return the covariance of the components of interest, shape (T, interest, interest) [m^2].
 
-        `scale` multiplies the sigmas of ranges and clock offsets, but not of the map error. The map causes the part ``Q
-        P Q`` of the covariance Q, the ranges cause ``Q - Q P Q``.
+        `scale` multiplies the sigmas of ranges and clock offsets, but not the sigmas of the map error. Map errors
+        contribute ``Q P Q`` to the covariance Q, range errors ``Q - Q P Q``.
         """
         k = self.interest
         covariance = self.covariance_m2
