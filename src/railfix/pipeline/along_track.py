@@ -155,10 +155,10 @@ def _against_wheel(
 def apply_spacing_verdict(
     result: AlongTrack, spacing: Screened | None, state: FilterState, held_s: float
 ) -> tuple[AlongTrack, FilterState]:
-    """Mark positions as doubtful where the two antennas' positions or speeds disagree; return them and the state.
+    """Mark positions as doubtful where the antennas' positions or speeds disagree; return positions and test state.
 
-    `spacing` has the screen's verdicts, shape (T,), or is None. A rejection also applies to the `held_s` seconds after
-    its epoch.
+    `spacing` has the verdicts of the antenna spacing screen, shape (T,), or is None. A rejection also applies to the
+    `held_s` seconds after its epoch.
     """
     time, error = result.tracked.time, result.spacing_error_m
     disagreed = np.full(len(time) + 1, state.disagreed)
@@ -210,8 +210,8 @@ def _run_filter(
 
     `single` has single-epoch arc lengths and their standard deviations, shape (T,) each [m].
 
-    With sensors, the epochs are processed in blocks of `_BLOCK_NS` of GPS time, independent of the chunks. At the start
-    of each block, the dead-reckoned position, at which the map's gradient is read, is set to the filter's position.
+    With sensors, the epochs are processed in blocks of `_BLOCK_NS` of GPS time, whatever the chunks. At the start of
+    each block, the dead-reckoned position, at which the map's gradient is read, is set to the filter's position.
     """
 
     def sine_at(arc_m: Floats) -> Floats:

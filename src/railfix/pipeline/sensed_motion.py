@@ -197,7 +197,7 @@ def _slope_and_bend(sine: Floats, turned_radps: Floats, speed_mps: Floats) -> tu
 def _wheel_acceleration(
     pulses: TachometerPulses, ticks: Integers, speed: PulseSpeeds, limits: TachometerLimits
 ) -> Floats:
-    """Return the wheel acceleration at the ticks; NaN after a lost tooth, which is not a slip."""
+    """Return the wheel acceleration at the ticks; NaN after a lost tooth, so that it does not count as a slip."""
     when, earlier, before = ((ticks * _TICK_NS - ago).astype("datetime64[ns]") for ago in (0, _MEAN_NS, _FAULT_NS))
     acceleration = pulse_acceleration(pulse_speeds(pulses, earlier, limits=limits), speed)
     return np.where(faults_until(pulses, when) > faults_until(pulses, before), np.nan, acceleration)

@@ -312,7 +312,7 @@ def _mean_between(time: Datetimes, values: Floats, edges: Datetimes) -> tuple[Fl
 
 
 def _silent(sensor: str, samples: SensorSamples | None, epochs: int) -> Masks:
-    """Return a mask of intervals; it is true for the last interval if a sensor's samples do not reach its end."""
+    """Return a mask of intervals; the last is true if the sensor's samples stop before the end of this interval."""
     last = np.arange(epochs) == epochs - 1
     return last if samples is not None and sensor in samples.silent else np.zeros(epochs, dtype=np.bool_)
 

@@ -67,6 +67,6 @@ class Solution(NotebookTable):
 
 @lru_cache
 def with_coordinates(failed_checks: str) -> Masks:
-    """Return a mask by status number: true if positions of that status have coordinates under `failed_checks`."""
+    """Return for each status number whether positions of that status have coordinates under `failed_checks`."""
     dropped = CHECK_FAILED if failed_checks == "drop" else ()
     return read_only(np.array([status in POSITIONED and status not in dropped for status in sorted(Status)]))

@@ -49,7 +49,7 @@ class AntennaRows:
         return [(index.trajectory, rows) for index, rows in zip(self.indices, self.parts, strict=True)]
 
     def apart(self, function: Callable[..., Value], *of_antennas: Sequence[Any]) -> list[Value]:
-        """Call a function with each antenna's search index, rows and items of the lists; return all results."""
+        """Call a function for each antenna with its search index, its rows, and its item of each list; return all."""
         return [function(*each) for each in zip(self.indices, self.parts, *of_antennas, strict=True)]
 
     def each(self, function: Callable[..., Value], *of_antennas: Sequence[Any]) -> Value:

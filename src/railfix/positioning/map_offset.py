@@ -194,8 +194,8 @@ def terms_of_epochs(
     """Return the contribution of each epoch to the sums of its window (`MapOffsetState.sums`), shape (T, 9).
 
     `ecef_m` are 3-D positions, `place_ecef_m` are the corresponding positions on the line, shape (T, 3), and `axes` are
-    the lateral and vertical unit vectors at the latter, shape (T, 2, 3). `nominal_m` (in C order) and `variance` are
-    fields of `OffsetErrors`.
+    the lateral and vertical unit vectors at the positions on the line, shape (T, 2, 3). `nominal_m` (in C order) and
+    `variance` are fields of `OffsetErrors`.
     """
     offset = np.einsum("tij,tj->ti", axes, ecef_m - place_ecef_m)
     gain = (axes @ covariance_m2) @ (

@@ -1,11 +1,11 @@
 """Section search: find the trajectory point that fits the ranges best.
 
-P1 2.2(2) compares between-satellite single differences of ranges with those of distances. The weighted sum of squares
-``q`` of these comparisons equals the weighted sum of squared residuals after elimination of the clocks. `find_section`
-finds the point with the least ``q`` in a time that hardly depends on the length of the line. If a 3-D position exists,
-``q`` increases from this position as a quadratic form, so that only points inside a ball are evaluated. Otherwise, the
-search is coarse to fine. It uses a bound: between two points, the root of ``q`` changes by at most the distance times
-the root of the summed weights. Both searches are exact.
+P1 2.2(2) compares differences of ranges between satellites with the differences of computed distances. The weighted sum
+of squares ``q`` of these comparisons equals the weighted sum of squared residuals after elimination of the clocks.
+`find_section` finds the point with the least ``q`` in a time that hardly depends on the length of the line. If a 3-D
+position exists, ``q`` increases from this position as a quadratic form, so that only points inside a ball are
+evaluated. Otherwise, the search is coarse to fine. It uses a bound: between two points, the root of ``q`` changes by at
+most the distance times the root of the summed weights. Both searches are exact.
 """
 
 from __future__ import annotations

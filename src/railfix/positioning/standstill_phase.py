@@ -118,7 +118,7 @@ def _search(cycles: Floats, lower: Floats, variance: Floats, count: int, below: 
 
 #: Largest number of integer vectors in a likelihood.
 _VECTORS: Final = 20
-#: Integer vectors are omitted if their log likelihood minus that of uniform phases is below this value.
+#: Integer vectors are omitted if log(likelihood / likelihood of uniform phases) is below this value.
 _NEGLIGIBLE: Final = -5.0
 
 

@@ -183,7 +183,7 @@ def _segment(
 def _ambiguities(
     matrix: Floats, right: Floats, arc_id: Integers, memory: Memory, *, held: bool
 ) -> tuple[Floats, Floats, ArcAmbiguities, Memory]:
-    """Return the ambiguities of each epoch's channels minus their first values, their covariances, arcs and memory.
+    """Return the corrections to the ambiguities' first values at each epoch, their covariances, arcs and memory.
 
     The shapes are (T, M, 3) and (T, M, M). The ambiguities are computed from the normal equations of the epoch and all
     earlier epochs. Arcs and memory are those after the last epoch. With `held`, the mean of the ambiguities is zero
