@@ -110,7 +110,7 @@ def test_a_length_of_nothing_stops_the_train(state: Interlocking) -> None:
         ({"front_m": 3050.0, "direction": -1}, "the train runs backward"),
         ({"front_m": 9e6}, "is not on the line"),
         ({"front_m": 4.6e16}, "is not on the line"),
-        ({"front_m": 3050.0, "line": 2}, "line 2, the train is on line 1"),
+        ({"front_m": 3050.0, "line": 2}, "line 2, but the train is on line 1"),
         ({"front_m": 3050.0, "speed_cmps": 190_000}, "speed"),
         ({"front_m": 3050.0, "over_cm": 90_000_000}, "bounds"),
         ({"front_m": 3050.0, "time_ns": 1}, "older than in the"),

@@ -559,7 +559,7 @@ def test_an_authority_that_ends_is_renewed_with_overlap(tmp_path: Path) -> None:
     """Both certificates of the authority are valid: old and new ends of the links trust each other."""
     old, new = tmp_path / "old", tmp_path / "new"
     write_keys(old, [7, 8], valid_days=20)
-    assert [text.partition(" ends")[0] for text in list_ending(old, "centre")] == ["the certificate centre.pem"]
+    assert [text.partition(" expires")[0] for text in list_ending(old, "centre")] == ["the certificate centre.pem"]
     shutil.copytree(old, new)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(keys_module, "AUTHORITY_DAYS", 25)
