@@ -77,7 +77,7 @@ def test_the_command_line_stands_over_the_file(tmp_path: Path) -> None:
     ("values", "words"),
     [
         ({"elevation": {"mask": 5.0}}, "unknown setting elevation.mask; known are mask_deg"),
-        ({"mask_deg": 5.0}, "is 'elevation.mask_deg' meant?"),
+        ({"mask_deg": 5.0}, "did you mean 'elevation.mask_deg'?"),
         ({"largest_sigma_m": -1}, "setting largest_sigma_m: Input should be greater than 0, got -1"),
         ({"screens": ("rain",)}, "unknown screen 'rain'; known are elevation"),
     ],

@@ -149,12 +149,12 @@ def _rewritten(old: str, new: str) -> Callable[[Path], object]:
 @pytest.mark.parametrize(
     ("change", "error", "words"),
     [
-        (_add_line, InputFileError, r"truth.csv: has the SHA-256 \w{12}..., case.toml states .*; fetch it again"),
+        (_add_line, InputFileError, r"truth.csv: has the SHA-256 \w{12}..., but case.toml states .*; fetch it again"),
         (lambda case: (case / "other.pos").unlink(), InputFileError, "other.pos: there is no such file; fetch it"),
         (lambda case: (case / "case.toml").unlink(), InputFileError, "no folder in it has a case.toml"),
         (_rewritten('"other.pos" =', '"another.pos" ='), SettingsError, "sha256 has no entry for other.pos; add its"),
         (_rewritten("held_out = false\n", ""), SettingsError, "case.toml: setting held_out is missing"),
-        (_rewritten("licence =", "license ="), SettingsError, "unknown setting license.* is 'licence' meant"),
+        (_rewritten("licence =", "license ="), SettingsError, "unknown setting license.* did you mean 'licence'"),
         (_rewritten('truth = "truth.csv"\n', ""), SettingsError, "setting files.truth is missing; give the file"),
         (_rewritten('truth = "', 'cn0_curve = "c.toml"\ntruth = "'), SettingsError, "files.cn0_curve is a setting"),
         (lambda case: (case / "case.toml").write_text("= 1"), InputFileError, "case.toml: is not valid TOML"),

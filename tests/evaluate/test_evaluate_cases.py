@@ -448,7 +448,7 @@ def test_sections_tell_the_environment_where_the_reference_does_not(tmp_path: Pa
     told = np.array(["", "depot", "", "", ""])
     found = evaluate_run(run, reference(time, place, environment=told), sections=file)
     assert found.epochs["environment"].to_list() == ["open", "depot", "cutting", "unknown", "station"]
-    assert any("environment of 3 of 5 epochs" in note for note in found.runs[0].notes)
+    assert any("for 3 of 5 epochs, the reference" in note for note in found.runs[0].notes)
     for text, line in (("0,100,open\n50,80,cutting\n", 3), ("5,5,open\n", 2), ("0,9,\n", 2)):
         file.write_text("from_m,to_m,environment\n" + text)
         with pytest.raises(InputFileError, match=f"line {line}"):

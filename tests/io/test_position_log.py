@@ -197,7 +197,7 @@ def test_rows_out_of_order_are_sorted_or_noted(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "columns", "error", "said"),
     [
-        (CSV.replace("latitude_deg", "lattitude_deg"), {}, InputFileError, "is 'latitude_deg' meant"),
+        (CSV.replace("latitude_deg", "lattitude_deg"), {}, InputFileError, "did you mean 'latitude_deg'"),
         (CSV.replace("height_m", "z"), {}, InputFileError, "have no height"),
         (CSV.replace("longitude_deg", "x"), {}, InputFileError, "no columns latitude_deg"),
         (CSV.replace("height_m", "height_ft"), {}, InputFileError, "line 1: column 'height_ft' is in feet; convert"),

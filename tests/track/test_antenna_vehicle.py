@@ -344,7 +344,7 @@ def test_vehicle_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "error", "said"),
     [
-        ("bogie_distance_m", "bogie_distanse_m", SettingsError, "is 'bogie_distance_m' meant"),
+        ("bogie_distance_m", "bogie_distanse_m", SettingsError, "did you mean 'bogie_distance_m'"),
         ("bogie_distance_m = 13.8", "", SettingsError, "bogie_distance_m is missing"),
         ("13.8", "-13.8", SettingsError, "bogie_distance_m"),
         ("13.8", "13800", SettingsError, "bogie_distance_m"),
@@ -352,7 +352,7 @@ def test_vehicle_file(tmp_path: Path) -> None:
         ("13.8", "nan", SettingsError, "bogie_distance_m"),
         ("1.067", "1067", SettingsError, "gauge_m"),
         ("1.067", "'wide'", SettingsError, "gauge_m"),
-        ("along_m = 9.1", "along = 9.1", SettingsError, "is 'along_m' meant"),
+        ("along_m = 9.1", "along = 9.1", SettingsError, "did you mean 'along_m'"),
         ("up_m = 4.1", "up_m = 4100", SettingsError, "antennas.front.up_m"),
         ("antennas.rear", "antennas.reer", SettingsError, "'front' or 'rear'"),
         ('name = "test car"', 'facing = "north"', SettingsError, "facing"),

@@ -171,8 +171,8 @@ def test_heights_are_never_guessed(
         ("35.0,139.0,50\n35.1,139,50\n", "line 1: has numbers where a header"),
         (HEADER + "\n", "0 points"),
         (HEADER + "\n" + ROWS[0], "1 point"),
-        (GOOD.replace("latitude_deg", "lattitude_deg"), "is 'latitude_deg' meant"),
-        (GOOD.replace("cant_mm", "cant_m"), "is 'cant_mm' meant"),
+        (GOOD.replace("latitude_deg", "lattitude_deg"), "did you mean 'latitude_deg'"),
+        (GOOD.replace("cant_mm", "cant_m"), "did you mean 'cant_mm'"),
         (GOOD.replace("latitude_deg", "y"), "no column 'latitude_deg'"),
         (GOOD.replace("height_m", "z"), "neither 'height_m' nor 'elevation_m'"),
         (GOOD.replace("cant_mm", "elevation_m"), "both 'height_m' and 'elevation_m'"),
@@ -284,7 +284,7 @@ def test_geojson_collection_and_multi_line_are_a_route(tmp_path: Path) -> None:
         (feature(LINE, height_datum="ellipsoidal", cant_mm=[1, 2]), "2 for 3 points"),
         (feature(LINE, height_datum="ellipsoidal", cant_mm=5), "a single value for 3 points"),
         (feature(LINE, height_datum="ellipsoidal", cant_mm=[1, 2, "x"]), "not a number"),
-        (feature(LINE, height_datum="ellipsoidal", cantt_mm=[1, 2, 3]), "is 'cant_mm' meant"),
+        (feature(LINE, height_datum="ellipsoidal", cantt_mm=[1, 2, 3]), "did you mean 'cant_mm'"),
     ],
 )
 def test_broken_geojson_is_refused_in_one_sentence(tmp_path: Path, document: object, said: str) -> None:

@@ -135,7 +135,7 @@ class LazyCommands(Commands):
         word = args[0] if args else ""
         near = [] if word in known or word.startswith("-") else difflib.get_close_matches(word, known, n=1, cutoff=0.5)
         if near:
-            ctx.fail(f"no such command: {word!r}; is {near[0]!r} meant?")
+            ctx.fail(f"no such command: {word!r}; did you mean {near[0]!r}?")
         name, command, rest = super().resolve_command(ctx, args)
         return name, load_command(str(name), self.modules.get(str(name))) if name in self.summaries else command, rest
 

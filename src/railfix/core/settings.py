@@ -125,7 +125,7 @@ def first_fault(model: type[BaseModel], error: ValidationError) -> str:
     if first["type"] == "extra_forbidden":
         known = sorted(_fields_at(model, first["loc"][:-1]))
         close = [*misspelt([str(first["loc"][-1])], known).values()] or _in_groups(model, str(first["loc"][-1]))
-        hint = "".join(f"; is {name!r} meant?" for name in close)
+        hint = "".join(f"; did you mean {name!r}?" for name in close)
         names = f"; known are {', '.join(known)}" if known else ""
         return f"unknown setting {where}{names}{hint}"
     if first["type"] == "missing":

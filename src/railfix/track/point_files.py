@@ -230,7 +230,7 @@ def _of_overpass(path: str, document: dict[str, Any], reading: MapReading) -> li
 def _segment(line: _GeojsonLine, crs: str, reading: MapReading) -> Segment:
     for wrong, right in misspelt(line.properties, (*OPTIONAL_COLUMNS, "geoid_m", *_MEMBERS)).items():
         if right not in line.properties:
-            raise line.error(f"property {wrong!r} is unknown; is {right!r} meant?")
+            raise line.error(f"property {wrong!r} is unknown; did you mean {right!r}?")
     place = _in_frame(line.source, crs, line.coordinates)
     of_way = get_metadata(line.feature)
     heights = None
@@ -339,11 +339,11 @@ def _check_columns(table: NamedColumns) -> tuple[str, ...]:
     close = misspelt(table.cells, KNOWN_COLUMNS)
     for wrong, right in close.items():
         if right not in table:
-            raise table.header_error(f"column {wrong!r} is unknown; is {right!r} meant?")
+            raise table.header_error(f"column {wrong!r} is unknown; did you mean {right!r}?")
     for wrong, right in misspelt(table.metadata, KNOWN_METADATA).items():
         if right not in table.metadata:
             raise InputFileError(
-                table.path, f"the line '# {wrong}: {table.metadata[wrong]}' is unknown; is '# {right}' meant?"
+                table.path, f"the line '# {wrong}: {table.metadata[wrong]}' is unknown; did you mean '# {right}'?"
             )
     for name in ("latitude_deg", "longitude_deg"):
         if name not in table:

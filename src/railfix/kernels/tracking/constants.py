@@ -92,7 +92,7 @@ NOMINAL_M: Final = 0.8
 #: is negative, the protection level is withheld: the map, a constellation or the clock may be wrong.
 BIAS_SATELLITES: Final = 2
 BIAS_INFLATED: Final = 1e6  #: Factor for the variance of excluded codes, which remain as monitors of the fault.
-#: Position sigma [m] that is added when a satellite is excluded whose codes have affected the position.
+#: Sigma that is added to the position when a satellite whose codes have affected the position is excluded [m].
 INFLATED_M: Final = 15.0
 INFLATED_SIGMAS: Final = 3.0  #: Code shift [sigmas] above which `INFLATED_M` is not added: all codes may have stepped.
 
@@ -105,28 +105,28 @@ MISFIT_CODES: Final = 4  #: Smallest number of codes from which position and clo
 #: they are steps of all codes and contain no information on the map.
 MISFIT_CLIPPED: Final = 3.0
 MISFIT_LEARNT_S: Final = 5.0  #: Time constant with which the length error adapts [s].
-#: Upper bound of the log variance of map lengths, 1.6 m per square root of a metre. Larger errors change no results.
+#: Upper bound of `map_log_variance`: length errors of 1.6 m per square root of a metre. More changes no results.
 MISFIT_LARGEST: Final = 8.0
 
 # Speeds.
-SPEED_SIGMAS: Final = 4.0  #: Bound of the error of a measured speed, in standard deviations.
+SPEED_SIGMAS: Final = 4.0  #: Largest assumed error of a measured speed, in standard deviations.
 
 # Branches.
-#: Distance of two branches at which half of their evidence is attributed to the map: three map errors of 2 m.
+#: Minimum of `map_branch_m`, the distance of branches at which evidence counts half: three map errors of 2 m.
 MAP_BRANCH_M: Final = 6.0
 #: Standard deviation of the code error by reflections that is common to all satellites on one side of a street.
 CODE_COMMON_M: Final = 10.0
 CODE_COMMON_S: Final = 120.0  #: Correlation time of the common code error.
 CODE_COMMON_TRAVEL_M: Final = 500.0  #: Correlation length of the common code error.
-BRANCH_FLOOR: Final = 1e-3  #: Lower bound of the probability, due to codes, of a branch within `BRANCH_FLOOR_M`.
-BRANCH_FLOOR_M: Final = 30.0  #: Distance within which `BRANCH_FLOOR` applies.
+BRANCH_FLOOR: Final = 1e-3  #: Lowest odds that codes give to a branch within `BRANCH_FLOOR_M` of the best branch.
+BRANCH_FLOOR_M: Final = 30.0  #: Distance from the best branch below which `BRANCH_FLOOR` applies [m].
 #: Improbable hypotheses are dropped only after this travel, because motion does not distinguish branches earlier.
 DECIDED_TRAVEL_M: Final = 60.0
-#: Probability below which hypotheses are dropped: a hundredth of the integrity risk of an independent error.
+#: Probability below which hypotheses are dropped: a hundredth of the integrity risk per independent code error.
 LEAST_PROBABILITY: Final = 1e-11
 START_SIGMA_M: Final = 30.0  #: Initial standard deviation of a hypothesis's position.
 GAP_S: Final = 5.0  #: Time without measurements after which the position search is repeated.
-#: Mean weight below which phases and Dopplers contradict the track. An error of one sigma has the weight 1.
+#: Mean weight below which phases and Dopplers contradict the track. Errors of one sigma have the weight 1.
 LOST_MOTION_WEIGHT: Final = 0.45
 LOST_MOTION_S: Final = 6.0  #: Time of contradicting phases and Dopplers after which the track is lost.
 LOST_CODE_WEIGHT: Final = 0.5  #: Mean weight below which codes contradict the track.
@@ -136,14 +136,14 @@ BEND_M: Final = 20.0
 EXPIRED_SIGMA_M: Final = 200.0  #: Largest standard deviation of a reported position.
 #: Probability ratio above which another hypothesis is reported. With a lower ratio, similar hypotheses could alternate.
 SWITCH: Final = 3.0
-#: Distance below which two laps cannot be distinguished permanently, in units of `map_branch_m`. Among such laps, the
-#: filter reports the lap that recent codes prefer.
+#: Distance between two laps, in units of `map_branch_m`, below which evidence does not decide between them for good.
+#: Among such laps, the filter reports the lap that recent codes prefer.
 ALIKE: Final = 1.5
 RECENT_S: Final = 30.0  #: Time constant with which the log odds from recent codes decay [s].
 RECENT_MOST: Final = 3.0  #: Bound of the log odds from recent codes.
-#: Largest log odds by motion between branches `map_branch_m` apart: 1 / (2 s^2) with s^2 = 2 (1/3)^2.
+#: Largest log odds, from motion, of branches `map_branch_m` apart: 1 / (2 s^2), with a map error s of sqrt(2) / 3.
 MOST_ODDS: Final = 2.25
-#: Largest log odds from the motion of one second or one epoch. Reflections would cause larger values.
+#: Largest log odds from the motion of one second (less for shorter intervals). Reflections would cause larger values.
 MOST_MOTION: Final = 5.0
 #: The position search is repeated if the log probability of the leading hypothesis was recently below this value,
 #: because all hypotheses that were more probable have then failed.
@@ -154,8 +154,8 @@ TAKEOVER_AFTER_S: Final = 15.0
 #: Smallest number of satellites whose phases, Dopplers or codes are evidence; fewer fit any speed and position.
 MOTION_SATELLITES: Final = 4
 MOTION_M: Final = 3.0  #: Travel per unit of log odds from motion [m]; at rest, motion is no evidence.
-#: Neighbouring positions are tried if phases and Dopplers contradict the track for this time [s]. Beyond an open end of
-#: the line, the track is lost after this time. A shorter contradiction is attributed to reflections.
+#: Neighbouring positions are tried if phases and Dopplers contradict the track for this time [s]. If the position is
+#: beyond an open end of the line, the track is lost instead. A shorter contradiction is attributed to reflections.
 BESIDE_AFTER_S: Final = 0.9
 
 # Monitors of the position.
@@ -163,16 +163,16 @@ BESIDE_AFTER_S: Final = 0.9
 #: Shorter contradictions are caused by noise, which the standard deviation includes.
 LEVEL_DOUBT_S: Final = 3.0
 LEVEL_DOUBT_CODE_S: Final = 8.0  #: As `LEVEL_DOUBT_S`, for codes.
-#: Time after a start in which the protection level is withheld while no hypothesis has the probability `YOUNG`. Also
-#: the time without a protection level after a loss of track by low weights.
+#: For this time after a start, the protection level is withheld unless a hypothesis has the probability `YOUNG`. After
+#: a loss of track by low weights, it is withheld for this time.
 LEVEL_START_S: Final = 15.0
 LEVEL_HOLD_S: Final = 5.0  #: Time from the last contradiction to the next protection level.
-#: Distance of the points ahead and behind at which the velocity is compared with the line, in sigmas of the position.
+#: The velocity is also compared with the line at points this many position sigmas ahead of and behind the position.
 REACH_SIGMAS: Final = 2.0
-REACH_M: Final = 3.0  #: Smallest distance of the points ahead and behind [m].
+REACH_M: Final = 3.0  #: Smallest distance of these two points from the position [m].
 VELOCITY_FLOOR_MPS: Final = 0.15  #: Standard deviation of an additional error of the measured velocity [m/s].
 DIRECTION_SHARE: Final = 0.03  #: Smallest assumed error of the line's direction [rad].
-LARGEST_SQUARE: Final = 12.0  #: Bound of an epoch's squared contradiction in the cumulative sum (E. S. Page, 1954).
+LARGEST_SQUARE: Final = 12.0  #: Upper bound of one epoch's square in the cumulative sum (E. S. Page, 1954).
 ALLOWED_SQUARE: Final = 4.0  #: Decrease of the cumulative sum per second.
 CONTRADICTION_DOUBT: Final = 12.0  #: Cumulative sum above which the protection level is withheld.
 CONTRADICTION_LOST: Final = 30.0  #: Cumulative sum at which the track is lost.
@@ -181,15 +181,15 @@ CONTRADICTION_TAKEN: Final = 60.0
 #: Mean code shift above which codes contradict motion, in standard deviations. Possible causes are a step or a slow
 #: drift of all codes, or a wrong map.
 DRIFT_SIGMAS: Final = 5.0
-#: Log variance of map lengths that contradicts motion (6 times the error).
+#: Value of `map_log_variance` above which the map contradicts motion: 6 times the assumed length error.
 DRIFT_LOG: Final = 2.0 * math.log(6.0)
-#: Mean weight of Dopplers and phases over `MOTION_FIT_S` below which they are inconsistent with any speed, as beyond a
+#: Mean weight, over `MOTION_FIT_S`, below which Dopplers and phases fit no speed. This occurs if the train has passed a
 #: bend that the estimated position has not reached. The limit applies if no wheel or radar measures the speed.
 MOTION_FIT: Final = 0.6
 MOTION_FIT_S: Final = 2.0
-#: Significant lateral displacement of the map, estimated by the sub-filter with a wrong map, in standard deviations.
+#: Lateral displacement in sigmas, from the sub-filter for a wrong map, above which the map counts as displaced.
 BESIDE_SIGMAS: Final = 4.5
-BESIDE_M: Final = 8.0  #: Significant lateral displacement of the map [m]; both limits must be exceeded.
+BESIDE_M: Final = 8.0  #: Displacement above which the map counts as displaced [m], if `BESIDE_SIGMAS` is exceeded, too.
 #: Within `LEVEL_START_S` after a start, the protection level requires this probability of the leading hypothesis.
 YOUNG: Final = 0.99
 YOUNG_HOLD_S: Final = 1.0  #: Time without a protection level after the probability was below `YOUNG`.
