@@ -94,9 +94,9 @@ class InterferenceLimits(Settings):
     #: Minimum jump of the codes relative to the Dopplers, without whole milliseconds, that counts as a sign. Phone
     #: clocks step by 30 m without interference.
     clock_jump_m: float = Field(default=60.0, gt=0)
-    drift_jump_mps: float = Field(default=10.0, gt=0)  #: Minimum jump of the clock drift that counts as a sign.
-    speed_jump_mps: float = Field(default=5.0, gt=0)  #: Minimum jump of the 3-D velocity that counts as a sign.
-    position_jump_m: float = Field(default=30.0, gt=0)  #: Minimum jump of the 3-D position that counts as a sign.
+    drift_jump_mps: float = Field(default=10.0, gt=0)  #: Jumps of the clock drift by more than this count as a sign.
+    speed_jump_mps: float = Field(default=5.0, gt=0)  #: Jumps of the 3-D velocity by more than this count as a sign.
+    position_jump_m: float = Field(default=30.0, gt=0)  #: Jumps of the 3-D position by more than this count as a sign.
     #: Minimum distance of the 3-D position from the line that counts as a sign. A yard is about 100 m wide.
     off_map_m: float = Field(default=100.0, gt=0)
     #: Minimum estimated time-tag error that counts as a sign. For correct time tags, the estimated error reaches 0.05 s
@@ -113,12 +113,12 @@ class InterferenceLimits(Settings):
     #: Largest acceleration of a train. Only the part of a change that this acceleration cannot explain is a jump.
     acceleration_mps2: float = Field(default=2.0, gt=0)
     max_speed_mps: float = Field(default=100.0, gt=0)  #: Largest speed of a train.
-    longest_gap_s: float = Field(default=10.0, gt=0)  #: Largest interval between two epochs that are compared.
+    longest_gap_s: float = Field(default=10.0, gt=0)  #: Epochs further apart than this are not compared.
     largest_speed_sigma_mps: float = Field(default=2.0, gt=0)  #: Velocities with a larger sigma are not compared.
     largest_sigma_m: float = Field(default=30.0, gt=0)  #: Positions with a larger sigma are not compared.
     #: Time for which a fall of C/N0 or gain, equal C/N0, or a position off the map must persist to be a sign.
     hold_s: float = Field(default=3.0, gt=0)
-    part_hold_s: float = Field(default=10.0, gt=0)  #: Time for which two constellations must differ.
+    part_hold_s: float = Field(default=10.0, gt=0)  #: A difference of two constellations is a sign after this time.
     #: Length of the window over which GNSS and wheel distances are compared.
     wheel_window_s: float = Field(default=120.0, gt=0)
     wheel_least_s: float = Field(default=60.0, gt=0)  #: Minimum length of a window that begins at a slip or a data gap.

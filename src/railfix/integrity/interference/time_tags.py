@@ -19,8 +19,8 @@ from railfix.integrity.interference.range_fits import MotionInputs, clock_column
 #: Scale of the design column of the time-tag error: order of magnitude of a satellite's range rate [m/s].
 _RATE_MPS: Final = 500.0
 _TAG_EPOCHS: Final = 10  #: Largest number of epochs in the median time-tag error.
-_TAG_LEAST: Final = 3  #: Smallest number of epochs in the median time-tag error.
-_TAG_WINDOW: Final = np.timedelta64(60, "s")  #: Largest age of an epoch in the median time-tag error.
+_TAG_LEAST: Final = 3  #: Minimum number of epochs required for the median time-tag error.
+_TAG_WINDOW: Final = np.timedelta64(60, "s")  #: Epochs older than this are not used in the median time-tag error.
 _STEPS: Final = 6  #: Largest number of iterations of a fit.
 _SETTLED_S: Final = 0.05  #: Change of the time-tag error below which the iteration ends [s].
 _SETTLED_M: Final = 100.0  #: Change of the position below which the iteration ends [m].

@@ -33,7 +33,7 @@ from railfix.integrity.raim import LinearModel
 SATELLITE_PRIOR: Final[Mapping[str, float]] = MappingProxyType(
     {"G": 1e-5, "J": 3e-5, "E": 3e-5, "C": 3e-5, "R": 3e-5, "S": 3e-5, "I": 3e-5}
 )
-MOST_EXCLUDED: Final = 2  #: Largest number of excluded satellites for a finite level (P1 2.3(4)).
+MOST_EXCLUDED: Final = 2  #: With more excluded satellites, the level is infinite (P1 2.3(4)).
 MOST_TOGETHER: Final = 4  #: Largest number of faulty single satellites in a hypothesis.
 
 
@@ -74,7 +74,7 @@ class RiskBudget(Settings):
     #: Fraction of the risk for faults that no hypothesis covers. If their probability exceeds it, more faults become
     #: hypotheses, with up to four satellites and three shared faults (constellation, side, map) at the same time.
     unchecked_share: float = Field(default=0.3, gt=0, lt=1)
-    #: Fraction of the risk for epochs with one excluded satellite, and equally for epochs with two.
+    #: Fraction of the risk for epochs with one excluded satellite; epochs with two have an equal fraction.
     exclusion_share: float = Field(default=0.1, ge=0, lt=0.5)
     #: Probability per epoch that noise alone makes the solution separations exceed their thresholds; 1e-3 in P4.
     false_alarm: float = Field(default=1e-3, gt=0, lt=1)
@@ -177,7 +177,7 @@ def set_sums(prior: Floats, most: int) -> Floats:
     return np.stack(sums, axis=1)
 
 
-#: Largest number of shared faults in a hypothesis. The probability of more is subtracted from the risk.
+#: Largest number of shared faults in a hypothesis. The probability of more shared faults is subtracted from the risk.
 _MOST_SHARED: Final = 3
 FEW: Final = 2  #: Allocations of at most this number of epochs are cached. A live chunk has one epoch per antenna.
 #: Number of cached allocations. They are used again when obstructed satellites reappear.

@@ -108,8 +108,8 @@ class MapDeviation(NamedTuple):
     """Lateral and vertical map error in addition to the map sigmas."""
 
     bias_m: ArrayLike = 0.0  #: Map offset not covered by the map sigmas, shape (T, 2) or (2,).
-    #: Lateral and vertical offset of the 3-D position from the map, shape (T, 2) [m], and its inverse covariance, shape
-    #: (T, 2, 2) [1/m^2] (0 if unknown). If present, a wrong map is a hypothesis.
+    #: Lateral and vertical offset of the 3-D position from the map, shape (T, 2) [m], and the inverse covariance of the
+    #: offset, shape (T, 2, 2) [1/m^2] (0 if unknown). If present, a wrong map is a hypothesis.
     seen: tuple[Floats, Floats] | None = None
 
 

@@ -35,12 +35,12 @@ class RaimLimits(Settings):
     false_alarm: float = Field(default=1e-3, gt=0, lt=1)
     #: Probability of missing a fault of the minimal detectable size. P4 states no value.
     missed_detection: float = Field(default=1e-3, gt=0, lt=1)
-    #: In mode "fixed", limit of the sum of squared residuals, and smallest squared error of an excluded satellite; P1
-    #: table 6 ("FDE 2 SAT, 100 m2").
+    #: In mode "fixed", limit of the sum of squared residuals, and lower limit of an excluded satellite's squared error;
+    #: P1 table 6 ("FDE 2 SAT, 100 m2").
     fixed_limit_m2: float = Field(default=100.0, gt=0)
     #: Largest number of satellites excluded at an epoch; 2 in P1 2.3(4).
     max_excluded: int = Field(default=2, ge=0, le=2)
-    min_redundancy: int = Field(default=1, ge=1)  #: Minimum degrees of freedom after an exclusion.
+    min_redundancy: int = Field(default=1, ge=1)  #: Minimum degrees of freedom that remain after an exclusion.
     #: Probability that noise alone makes the WSSE of the correct exclusion exceed the WSSE of a competing exclusion by
     #: more than the separation (chi-square, one degree of freedom). An epoch is inseparable if another exclusion of as
     #: many satellites passes and its WSSE is larger by less than the separation.
