@@ -236,7 +236,7 @@ CASES: Final[tuple[Odd, ...]] = (
     Odd("cant_in_metres.csv", _with(np.full(N, 0.1), "cant_mm"), "found", "in metres instead of millimetres"),
     Odd("radius_in_kilometres.csv", _with(np.full(N, 0.5), "radius_m"), "found", r"radius of 0\.5 m"),
     Odd("kilometrage.csv", _with(_KILOMETRAGE, "kilometrage_m"), "right"),
-    Odd("kilometrage_in_kilometres.csv", _with(_KILOMETRAGE / 1e3, "kilometrage_m"), "found", "whether it is in metres"),
+    Odd("kilometrage_in_kilometres.csv", _with(_KILOMETRAGE / 1e3, "kilometrage_m"), "found", "it is in metres"),
     Odd(
         "kilometrage_jumps.csv", _with(_KILOMETRAGE + 500 * (_KILOMETRAGE > 500), "kilometrage_m"), "found",
         "the kilometrage changes by 526",

@@ -104,7 +104,7 @@ WRONG: dict[str, tuple[Callable[..., object], str]] = {
     ),
     "name of a run": (lambda _: railfix.evaluate_runs(["run"]), "expected RunAndReference, got str"),
     "report on a result": (lambda m: railfix.write_report([m["result"]], "a.html"), "expected a path or several paths"),
-    "picture of a result": (lambda m: plots.plot_plan(m["result"]), "expected a polars table, got Result; give positions_t"),
+    "picture of a result": (lambda m: plots.plot_plan(m["result"]), "expected a polars table, got Result; give p"),
     "picture without errors": (
         lambda m: plots.plot_error_over_time(railfix.positions_table(m["result"])), "the table lacks a column"
     ),
