@@ -1,4 +1,4 @@
-"""Detection of a scale step or of missing speeds of a radar, by comparison with speeds from satellite Dopplers."""
+"""Detection of a radar's scale step or missing speeds, by comparison with speeds from satellite Dopplers."""
 
 from __future__ import annotations
 

@@ -154,9 +154,9 @@ def cause_text(causes: Bits) -> Strings:
 def suspicion(causes: Bits) -> Codes:
     """Return the `Suspicion` of each epoch from its signs.
 
-    The first possible suspicion in a fixed order is returned. A time-tag error comes first, because it displaces
-    positions and clocks as a spoofer does. Spoofing precedes leaving the map, which explains neither jumps nor equal
-    C/N0.
+    If several suspicions are possible, the first in a fixed order is returned. A time-tag error comes first, because it
+    displaces positions and clocks as a spoofer does. Spoofing precedes leaving the map, which explains neither jumps
+    nor equal C/N0.
     """
     order = (
         (Sign.TIME_TAGS, Suspicion.TIME_TAGS), (_SPOOFING, Suspicion.SPOOFING_SUSPECTED),

@@ -28,7 +28,7 @@ _ROUNDS: Final = 2  #: Number of reweighted fits per iteration.
 _FITS_WELL: Final = 3.0  #: Residuals up to this multiple of their median have full weight.
 _SHOWN: Final = 3.0  #: Time-tag errors above this many sigmas are fitted again, constrained to the line.
 _NEAR_LINE_M: Final = 20.0  #: Standard deviation of the line constraint, lateral and vertical [m].
-_LEAST_FREEDOM: Final = 3  #: Minimum redundancy of the rows that agree with a time-tag error.
+_LEAST_FREEDOM: Final = 3  #: Minimum redundancy of a fit to the rows that agree with a time-tag error.
 #: Residuals below this many standard deviations agree with a fit. The cost function clips residuals at this limit.
 _AGREES: Final = 5.0
 #: Minimum reduction of the cost by an accepted time-tag error. It exceeds the cost of one clipped residual (25),
