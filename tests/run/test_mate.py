@@ -73,6 +73,14 @@ def test_an_unknown_column_is_refused_with_one_sentence(folder: Path, tmp_path: 
         read_observations(path)
 
 
+def test_a_lock_shorter_than_the_time_since_the_last_epoch_was_lost(folder: Path, tmp_path: Path) -> None:
+    rows = pl.read_parquet(folder / "S_GNSS_SAT.parquet").filter(pl.col("GPS_TOW") % 10 == 0)
+    for later_s, lost in ((8.0, True), (15.0, False)):
+        lock = pl.when(pl.col("GPS_TOW") == pl.col("GPS_TOW").min()).then(5.0).otherwise(later_s)
+        rows.with_columns(LOCK_TIME=lock).write_parquet(tmp_path / "S_GNSS_SAT.parquet")
+        assert bool(read_observations(tmp_path / "S_GNSS_SAT.parquet").loss_of_lock[1].any()) == lost
+
+
 def test_sensors_and_balises_are_those_of_the_simulator(folder: Path) -> None:
     given = find_inputs(folder)
     samples = read_sensors(**{name: given[name] for name in ("inertial", "radar", "balises")})
@@ -106,23 +114,15 @@ def test_lines_circles_and_clothoids_of_the_digital_map_join(tmp_path: Path) -> 
     """East on a line, by a clothoid into a circle to the right of 500 m: worked out by the Fresnel integrals."""
     from scipy.special import fresnel
 
-    length, radius, spiral = 100.0, 500.0, 80.0
-    constant = np.sqrt(radius * spiral)
+    length, radius, spiral, east, north = 100.0, 500.0, 80.0, 2_600_000.0, 1_200_000.0
+    constant, azimuth = np.sqrt(radius * spiral), 0.5 * np.pi + spiral / (2.0 * radius)
     scale = constant * np.sqrt(np.pi)
     sine, cosine = fresnel(spiral / scale)
-    east, north = 2_600_000.0, 1_200_000.0
     end = np.array([east + length + scale * cosine, north - scale * sine])
-    azimuth = 0.5 * np.pi + spiral / (2.0 * radius)
     centre = end + radius * np.array([np.sin(azimuth + 0.5 * np.pi), np.cos(azimuth + 0.5 * np.pi)])
     bearing = np.arctan2(*(end - centre)) % (2.0 * np.pi)
-    name = (
-        "TRACK_SEGMENT_TYPE",
-        "TRACK_SEGMENT_REFERENCE_POSITION",
-        "TRACK_SEGMENT_LENGTH",
-        "EAST",
-        "NORTH",
-        "AZIMUTH",
-    )
+    of = "TRACK_SEGMENT"
+    name = (f"{of}_TYPE", f"{of}_REFERENCE_POSITION", f"{of}_LENGTH", "EAST", "NORTH", "AZIMUTH")
     rows = [
         dict(zip(name, ("line", 0.0, length, east, north, 0.5 * np.pi), strict=True)),
         dict(zip(name, ("clothoid", length, spiral, east + length, north, 0.5 * np.pi), strict=True))

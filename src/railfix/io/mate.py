@@ -195,9 +195,9 @@ def _as_arrays(
         values[name][row, column] = table[source].cast(pl.Float64).fill_null(np.nan).to_numpy()
     time = times.astype("datetime64[ns]")
     lock = values.pop("lock_s")
-    # a lock time (in whole seconds) that decreases means that the lock was lost
-    lost = np.zeros(lock.shape, dtype=np.uint8)
-    lost[1:] = lock[1:] < np.fmin(lock[:-1], lock[:-1] + seconds(np.diff(time))[:, None] - 1.0 + 1e-6)
+    # the lock was lost if its time (in whole seconds) has decreased, or is shorter than the time since the last epoch
+    lost, passed_s = np.zeros(lock.shape, dtype=np.uint8), seconds(np.diff(time))[:, None]
+    lost[1:] = lock[1:] < np.fmax(np.fmin(lock[:-1], lock[:-1] + passed_s - 1.0 + 1e-6), passed_s - 1.0)
     return Observations(
         time=time,
         satellite=np.array([name[:3] for name in channels.tolist()]),
