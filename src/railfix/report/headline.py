@@ -53,12 +53,12 @@ def _with_errors(run: ReportedRun, antenna: str, evaluation: Evaluation, passed:
     """Return the headline with errors; `passed` has the figures of the single epochs that passed every check."""
     other = get_figures(evaluation, run, antenna, "conventional")
     filtered = get_figures(evaluation, run, antenna, "constrained", table="train")
-    whose = "there is" if filtered else "the train has"
+    position = "a single-epoch position" if filtered else "the train's position"
     passing = "No single-epoch position with a reference passed every check."
     if passed.get("errors"):
         passing = (
-            f"In {share(passed['rate'], 1)} of the epochs with satellite signals, {whose} a position on the line that "
-            f"passed every check; 95 % of the errors of these positions are below {number(passed['p95_m'], 1)} m, and "
+            f"In {share(passed['rate'], 1)} of the epochs with satellite signals, {position} on the line passed every "
+            f"check; 95 % of the errors of these positions are below {number(passed['p95_m'], 1)} m, and "
             f"the largest is {number(passed['max_m'], 1)} m (conventional positions: {number(other.get('p95_m'), 1)} m "
             f"and {number(other.get('max_m'), 1)} m)."
         )
