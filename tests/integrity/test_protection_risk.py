@@ -96,9 +96,9 @@ def test_budgets_that_are_refused(wrong):
 
 def test_measured_priors_are_given():
     """Nothing else takes the word "assumed" from a level; default values do not count as measured."""
-    with pytest.raises(SettingsError, match="local_prior and side_prior not given"):
+    with pytest.raises(SettingsError, match="requires local_prior and side_prior"):
         RiskBudget(priors="measured")
-    with pytest.raises(SettingsError, match="measured, but side_prior not given"):
+    with pytest.raises(SettingsError, match="requires side_prior"):
         RiskBudget(priors="measured", local_prior=2e-5)
     stated = RiskBudget(priors="measured", local_prior=2e-5, side_prior=3e-6)
     assert stated.replaced(map_prior=0.0).priors == "measured"

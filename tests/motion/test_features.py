@@ -90,7 +90,9 @@ def test_the_gap_to_the_last_feature_agrees_within_three_sigmas(earlier_m: float
     last = (free.arc_m - way_m - share * allowed, earlier_m, way_m)
     found = _locate(line, POINTS[2], POINTS[2], 5, last=last)
     assert (found.verdict, found.reason) == (
-        ("accepted", "") if abs(share) < 1.0 else ("none", "distance from the last feature disagrees with the wheel")
+        ("accepted", "")
+        if abs(share) < 1.0
+        else ("none", "distance from the last feature disagrees with the wheel distance")
     )
 
 

@@ -19,20 +19,19 @@ from railfix.positioning.line_fix import FixLimits, LineFix, refit_epochs
 from railfix.positioning.noise_windows import Windows
 from railfix.positioning.range_arrays import Ranges, without
 
-#: Smallest redundancy number (fraction of a range error that appears in its residual) of a tested range.
+#: Ranges with a smaller redundancy number (fraction of a range error that appears in the residual) are not tested.
 _LEAST_REDUNDANCY: Final = 0.1
-#: Smallest mean residual that is kept in the state.
-_FORGOTTEN: Final = 1e-12
-#: Minimum degrees of freedom after a rejection. The remaining ranges can then still be tested.
+_FORGOTTEN: Final = 1e-12  #: Channels whose mean residuals are all smaller are dropped from the state.
+#: Degrees of freedom that must remain after a rejection, so that the remaining ranges can still be tested.
 _LEAST_FREEDOM: Final = 2
 
 
 class LastingErrorLimits(Settings):
     """Limits of the test for persistent range errors."""
 
-    #: Time constant of the mean residual. On a moving train, reflections last less than the default of one minute.
+    #: Time constant of the mean residual. By default 60 s: reflections on a moving train last less than a minute.
     memory_s: float = Field(default=60.0, gt=0)
-    #: Clipping limit of residuals, in standard deviations of the weights or of the receiver noise, whichever is larger.
+    #: Residuals are clipped at this many sigmas; the sigma is from the weights or, if larger, from the receiver noise.
     clipped: float = Field(default=2.0, gt=0)
     #: Mean residual, as a fraction of `clipped`, above which a satellite is rejected. On fault-free city recordings,
     #: the largest mean is 0.59, except for satellites received by reflection only. If one satellite has an error of 20
@@ -48,9 +47,9 @@ class LastingErrorState:
 
     #: Time of the last epoch, NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    age: float = 0.0  #: Age of the means at the last epoch, in windows of `memory_s`.
+    age: float = 0.0  #: Age of the means at the last epoch, in multiples of `memory_s`.
     channel: Strings = field(default_factory=lambda: np.empty(0, dtype="<U6"))  #: Satellite and signal, shape (S,).
-    #: Sums for the noise scale of all ranges, including faulty ranges (`NoiseState`), shape (2,).
+    #: Sums (`NoiseState`) from which the noise scale of all ranges, including faulty ranges, is computed; shape (2,).
     noise: Floats = field(default_factory=lambda: np.zeros(2))
     #: Mean residuals as fractions of `clipped`, shape (S, P); column p is the mean after rejecting p satellites.
     sums: Floats = field(default_factory=lambda: np.empty((0, 0)))

@@ -21,7 +21,7 @@ class PointStatus(IntEnum):
     VALID = 0
     #: No position.
     NO_POSITION = 1
-    #: The residuals exceed the noise.
+    #: The test statistic of the residuals reaches its threshold.
     RESIDUALS = 2
     #: The dilution of precision exceeds its limit, or the geometry is singular.
     DILUTION = 3

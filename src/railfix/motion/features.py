@@ -25,7 +25,7 @@ _GRADIENT_CHANGE: Final = 0.003  #: Smallest change of gradient that counts as a
 _CURVATURE_CHANGE_1PM: Final = 1e-3
 #: Smallest likelihood ratio of an accepted position to any other position in the search window.
 _LIKELIHOOD_RATIO: Final = 1e3
-_GAP_SIGMAS: Final = 3.0  #: Largest error of the wheel distance since the last feature, in sigmas.
+_GAP_SIGMAS: Final = 3.0  #: Limit of the difference of map and wheel distance since the last feature, in sigmas.
 _FIT_LIMIT: Final = 3.0  #: Largest mean squared residual of the second quantity, in units of its variance.
 SCALE_SIGMA: Final = 2e-3  #: Relative standard deviation of a distance from wheel pulses.
 STEP_M: Final = 1.0  #: Spacing of the series along the line.
@@ -60,7 +60,7 @@ class Feature:
 
 
 def line_series(trajectory: Trajectory) -> LineSeries:
-    """Compute gradient and curvature of a trajectory over chords of `BASE_M`, as measured on two bogies."""
+    """Compute gradient and curvature of a trajectory over chords of `BASE_M`, like measurements on two bogies."""
     half = 0.5 * BASE_M
     arc = np.arange(half, float(trajectory.arc_m[-1]) - half, STEP_M)
     front, rear = trajectory.at_arc(arc + half), trajectory.at_arc(arc - half)
@@ -81,8 +81,9 @@ def line_series(trajectory: Trajectory) -> LineSeries:
 def map_features(series: LineSeries, *, least: Mapping[Quantity, Floats] | None = None) -> list[Feature]:
     """Find the largest changes of gradient and of curvature over `BASE_M`, in the order of their arc lengths.
 
-    The position of a feature is the middle of its change. For a measured line, `least` has a bound per point and
-    quantity, shape (N,). A change is then ignored if it is below the root sum of squares of the bounds at its two ends.
+    The position of a feature is the middle of its change. For a measured line, `least` has, for each quantity, a bound
+    at each point, shape (N,). A change is then ignored if it is below the root sum of squares of the bounds at its two
+    ends.
     """
     reach, around_steps = 2 * max(round(BASE_M / STEP_M), 1), round(HALF_LENGTH_M / STEP_M)
     found: list[Feature] = []
@@ -142,7 +143,7 @@ def locate(
     quantity : {"gradient", "curvature"}
         Quantity that is matched. The second quantity must agree with the map at the estimated position.
     noise : tuple of float
-        Standard deviations of gradient [1] and curvature [1/m] at one point of the series.
+        Standard deviations of the gradient and of the curvature [1/m] at each point of the series.
     last : tuple of float, optional
         Arc length of the last accepted feature, its sigma, and the wheel distance travelled since that feature [m].
 
@@ -181,7 +182,7 @@ def locate(
         gap = place - last[0]
         allowed = _GAP_SIGMAS * np.sqrt(sigma**2 + last[1] ** 2 + (SCALE_SIGMA * last[2]) ** 2)
         if abs(gap - last[2]) > allowed:
-            return _unplaced("none", sigma, "distance from the last feature disagrees with the wheel")
+            return _unplaced("none", sigma, "distance from the last feature disagrees with the wheel distance")
     return LocatedFeature(verdict="accepted", arc_m=place, sigma_m=sigma)
 
 

@@ -52,7 +52,7 @@ class RadarAlarm:
 
 @dataclass(kw_only=True)
 class RadarWatch:
-    """Ratios of radar speed to satellite-derived speed in the last windows of GPS time."""
+    """Ratios of radar speed to satellite-derived speed in the last windows."""
 
     #: Ratio of the radar speed to the satellite-derived speed, minus 1, in each window.
     ratio: deque[float] = field(default_factory=lambda: deque(maxlen=_MOST_BEFORE + _AFTER))

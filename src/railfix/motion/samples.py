@@ -84,10 +84,10 @@ class GroundUnits:
 
 @dataclass(frozen=True, kw_only=True)
 class BaliseReadings(Samples):
-    """N readings of balises by the train. In a group of balises, only the balise in the balise list has a reading."""
+    """N readings of balises by the train. Of a group of balises, only the balise in the balise list is included."""
 
     balise: Strings = field(default_factory=lambda: np.empty(0, dtype="<U1"))  #: Identity of the balise, shape (N,).
-    #: Standard deviation along the line, reported by the reader; NaN if not reported; shape (N,).
+    #: Sigma of the balise's detected position along the line, shape (N,); NaN if the reader does not report it.
     sigma_m: Floats = field(default_factory=lambda: np.empty(0))
 
 

@@ -1,17 +1,19 @@
-r"""Detection of slip, slide, low speed and rolling away by the vehicle's pitch (P2 2.1), and speed during these states.
+r"""Detection, from the vehicle's pitch, of slip, slide, low speed and rolling away (P2 2.1); speed in these states.
 
 While the wheel rolls, ``sin(theta_T) = (f_x - a_T) / g`` from accelerometer and tachometer is the sine of the pitch.
 During a slip, this sine exceeds the gradient of any line. There are two rules:
 
 * ``"p2"`` detects a slip where ``|sin(theta_T)|`` exceeds the steepest gradient plus an allowance for the pitch of the
   body. This rule detects only changes of the slip speed. The distance error of a long slide at constant slip remains.
-* ``"map"`` compares the pitch with the gradient of the line at the present position. Here, a slip ends only when both
-  the wheel speed agrees with the inertial speed and the pitch agrees, or when wheel and train are at rest (latch).
+* ``"map"`` compares the pitch with the gradient of the line at the present position. Here, a slip ends only when the
+  wheel speed agrees with the inertial speed and the pitch agrees with the gradient, or when wheel and train are at rest
+  (latch).
 
 During a slip, speed and distance are integrated from the accelerometer, corrected for pitch and offset. With "map", the
 integration starts before the detection (`LOOK_BACK_S`). The offset is estimated while the wheel rolls. Without a gyro,
 the pitch is the slope of the line where the position is known. With a gyro, the pitch is the integral of the pitch rate
-(P2 2.1(3)). It is slowly corrected to the slope of the line or, if unknown, to the pitch from wheel and accelerometer.
+(P2 2.1(3)). It is slowly corrected to the slope of the line or, where the slope is unknown, to the pitch from wheel and
+accelerometer.
 """
 
 from __future__ import annotations
@@ -43,16 +45,17 @@ class MotionState(IntEnum):
     EXPIRED = 7  #: The inertial speed is too old or implausible; there is no speed.
 
 
-#: Larger differences of the pitch sines of vehicle and line indicate a slip; equivalent to 0.15 m/s2.
+#: A larger difference between the sine of the pitch from wheel and accelerometer and the sine of the reference pitch
+#: indicates a slip. The limit is equivalent to 0.15 m/s2.
 _MAP_LIMIT: Final = 0.015
-#: Largest difference of the pitch sines in standard deviations while the wheel rolls; the larger limit is used. This
-#: limit is required because a pitching body accelerates an accelerometer that is mounted high.
+#: As `_MAP_LIMIT`, in sigmas of the difference while the wheel rolls; the larger of the two limits is used. This limit
+#: is required because a pitching body accelerates an accelerometer that is mounted high.
 _NOISE_SIGMAS: Final = 5.0
 _NOISE_S: Final = 30.0  #: Time constant with which the standard deviation of the pitch sines is estimated.
 _LATCH_MPS: Final = 0.15  #: Largest difference of wheel and inertial speeds at which a slip can end.
 _LATCH_SHARE: Final = 0.01  #: As `_LATCH_MPS`, but a fraction of the speed; the larger of the two limits is used.
 _LATCH_S: Final = 0.5  #: Time for which the speeds must agree before a slip ends.
-#: The inertial speed of a slip starts this time plus `confirm_s` plus `SMOOTHING_S` before the slip is detected.
+#: Integration of a slip's inertial speed starts before the detection, by this time + `confirm_s` + `SMOOTHING_S`.
 LOOK_BACK_S: Final = 0.3
 #: Longest use of an inertial speed; with the assumed drift `carry_drift_mps2`, its error is then 0.3 m/s.
 _LONGEST_CARRY_S: Final = 30.0
@@ -374,7 +377,7 @@ class _Automaton:
             self.state, self.speed = MotionState.EXPIRED, float("nan")
 
     def _watch(self, dt: float, force: float) -> None:
-        """Detect rolling away by a change of the forward force since standstill, when it was a component of gravity."""
+        """Detect rolling away by comparing the forward force with its value at standstill, a component of gravity."""
         limits = self.limits
         self._stood += dt
         if self.state == MotionState.STANDING and self._stood < _SETTLING_S:

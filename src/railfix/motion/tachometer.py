@@ -73,7 +73,7 @@ def pulse_speeds(pulses: TachometerPulses, time: Datetimes, *, limits: Tachomete
         size = count * limits.pulse_m / duration
         spread = size * np.sqrt(2.0 * limits.jitter_s**2 + limits.resolution_s**2 / 6.0) / duration
     valid = some & (duration > 0) & (size >= LEAST_SPEED_MPS) & (since <= limits.silence_s)
-    # reject speeds over twice the largest speed that is possible without a pulse since the last one
+    # reject speeds above twice the speed at which the next pulse would have come by now
     valid &= limits.pulse_m / np.maximum(since, 1e-9) >= 0.5 * size
     sign = np.where(pulses.direction[at] == 0, 1.0, pulses.direction[at])
     middle = pulses.time[first] + (pulses.time[at] - pulses.time[first]) // 2
@@ -122,8 +122,8 @@ def distance_m(pulses: TachometerPulses, time: Datetimes, *, limits: TachometerL
 def tooth_faults(pulses: TachometerPulses) -> tuple[Masks, Masks]:
     """Return masks of the pulses that follow a lost pulse, and of doubled pulses, shape (P,) each.
 
-    A pulse is lost in an interval twice as long as both neighbouring intervals, or where `pulse` numbers are missing. A
-    pulse is doubled if the sum of the intervals before and after it equals each neighbouring interval.
+    A pulse is lost in an interval about twice as long as each of its two neighbours, or where `pulse` numbers are
+    missing. A pulse is doubled if the sum of the intervals before and after it equals each neighbouring interval.
     """
     count = len(pulses)
     lost, doubled = np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
@@ -169,7 +169,7 @@ def check_speeds(time: Datetimes, speed_mps: Floats, right_time: Datetimes, righ
     """Estimate scale, unit and delay of logged speeds by least squares over a grid of delays.
 
     `speed_mps`, shape (N,), are logged speeds. `right_mps`, shape (M,), are reference speeds, for example from
-    Dopplers. Absolute speeds are compared. Raise ValueError if fewer than ten common speeds exceed 1 m/s.
+    Dopplers. Absolute speeds are compared. Raise ValueError for fewer than ten pairs above 1 m/s.
     """
     known = np.isfinite(right_mps)
     right_t = seconds(right_time[known] - right_time[0])

@@ -1,6 +1,6 @@
 """Build the reference positions of a run: check RTK fixes, match the fixes to the track, and bridge gaps.
 
-1. The positions of each antenna are checked singly, against the other antenna, and against the track (`fixes`).
+1. The positions of each antenna are checked one by one, against the other antenna, and against the track (`fixes`).
 2. The Dopplers are solved for the speed along the track at positions interpolated between fixes.
 3. The distance between fixes is compared with the measured distance travelled; fixes that disagree are rejected.
 4. All measurements are smoothed (`smoother`). The Dopplers are then solved at the smoothed positions, and all
@@ -187,7 +187,7 @@ class _ReferenceBuilder:
         """Return the closing error of each gap, in standard deviations of the most accurate sensor.
 
         The closing error is the distance that the sensor measured across the gap, minus the distance between the fixes
-        at both ends. The result is 1 where the closing error is within the noise.
+        at both ends. Values within the noise are replaced by 1.
         """
         good = fixes.good
         fix_time, moved = fixes.time[good], np.diff(fixes.arc_m[good])

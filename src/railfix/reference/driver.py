@@ -158,7 +158,7 @@ def antenna_record(part: Built) -> dict[str, Any]:
 
 
 SYSTEMS: Final = ("G", "J", "E", "C", "R")  #: Constellations whose Dopplers are used.
-_CHUNK: Final = 3000  #: Epochs of an observation log read at once.
+_CHUNK: Final = 3000  #: Number of epochs of an observation log that are read together.
 _NAMED: Final = 5  #: The notes list at most this number of gaps.
 
 
@@ -232,7 +232,7 @@ def _read(inputs: ReferenceInputs, line: OpenedLine, options: ReferenceOptions) 
     }
     notes = [note for log in logs.values() for note in log.notes]
     unrated = [log.path for log in logs.values() if not log.has_quality]
-    notes += [f"{path}: has no column of solution quality; every row is taken as a fix" for path in unrated]
+    notes += [f"{path} has no column of solution quality; every row is assumed to be an RTK fix" for path in unrated]
     dopplers: dict[str, Dopplers] = {}
     if inputs.logs:
         navigation = read_navigation(inputs.nav, **options.logs.arguments)

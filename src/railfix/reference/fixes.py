@@ -45,7 +45,7 @@ ACCELERATION_BIAS_MPS2: Final = 0.05  #: Standard deviation of the accelerometer
 
 
 class ReferenceSettings(Settings):
-    """Limits and noise of a reference, which are recorded in ``reference.json``."""
+    """Limits and noise parameters for building a reference; they are recorded in ``reference.json``."""
 
     #: Fixes with a smaller ratio of the ambiguity test are rejected, if the log has ratios (RTKLIB's default is 3).
     ratio: float = _limit("Fixes with a smaller ambiguity ratio (if logged) are rejected.", 3.0, "RATIO", "--ratio")
@@ -263,7 +263,7 @@ def _chain(position: Indices, arc_m: Floats, lateral_m: Floats, time_s: Floats, 
     if len(found) == len(position):
         return np.arange(len(found))
     reach = max_speed_mps * np.diff(time_s[found]) + _JITTER_M
-    # A step costs the distance travelled, so that a detour to another pass of a crossing costs its additional length.
+    # The cost of a step is its distance, so that a detour by another pass of a crossing adds its length to the cost.
     ways = (np.abs(after[:, None] - before) for before, after in pairwise(np.split(arc_m, first[1:])))
     steps = (way + np.where(way > limit, _OUT_OF_REACH_M, 0.0) for way, limit in zip(ways, reach, strict=True))
     return np.asarray(first + cheapest_path(np.split(np.abs(lateral_m), first[1:]), steps))
@@ -324,8 +324,8 @@ def judge_travel(
 def _best_chain(agrees: Callable[[Indices, Indices], Masks], time_s: Floats, hold_s: float) -> Masks:
     """Return the mask of the fixes in the best chain of runs.
 
-    A run is a sequence of successive fixes that agree with each other. The best chain has the longest total duration of
-    runs, minus `hold_s` for each disagreement between successive runs.
+    A run is a sequence of successive fixes that agree with each other. The best chain maximises the total duration of
+    its runs, minus `hold_s` for each pair of successive runs that disagree.
     """
     count = len(time_s)
     worth = np.minimum(np.diff(time_s, append=time_s[-1] + np.median(np.diff(time_s))), 1.0)

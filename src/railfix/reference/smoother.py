@@ -175,7 +175,7 @@ def _motion(states: _States, evidence: Evidence, dt: Floats, settings: Reference
 
     The states are position, speed and a time-correlated acceleration (Singer's model). The Doppler speed's error is a
     first-order Gauss-Markov process. The difference between wheel distance and position grows by the scale error times
-    the distance, and changes randomly by slip. The wheel's scale error and the accelerometer's offset are random walks.
+    the distance; slip adds a random change. The wheel's scale error and the accelerometer's offset are random walks.
     """
     count = len(evidence.time)
     transition, noise = np.zeros((2, count, states.count, states.count))
@@ -279,7 +279,7 @@ def closings(
 def lasting_error_mps(misclosures: Closings, settings: ReferenceSettings) -> float:
     """Return the sigma of the time-correlated error of the Doppler speed [m/s], estimated from the closing errors.
 
-    With fewer than `WINDOWS` windows, the setting is returned.
+    With fewer than `WINDOWS` windows, the setting `doppler_bias_mps` is returned.
     """
     if len(misclosures) < WINDOWS:
         return settings.doppler_bias_mps
@@ -292,7 +292,7 @@ def lasting_error_mps(misclosures: Closings, settings: ReferenceSettings) -> flo
 def slip_m(misclosures: Closings, settings: ReferenceSettings) -> float:
     """Estimate the wheel's random error [m per square root of m] from the closing errors, excluding the scale error.
 
-    With fewer than `WINDOWS` windows in motion, the setting is returned.
+    With fewer than `WINDOWS` windows in motion, the setting `slip_m` is returned.
     """
     moving = np.abs(misclosures.distance_m) > 1.0
     if moving.sum() < WINDOWS:

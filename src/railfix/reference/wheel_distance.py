@@ -29,8 +29,8 @@ class Wheel:
 
     @property
     def reading_sigma_m(self) -> float:
-        """Standard deviation of a reading [m]; a counter's error is assumed to be uniform over one pulse, other errors
-        to be 0.
+        """Standard deviation of a reading [m]; a counter's error is assumed to be uniform over one pulse, other
+        readings to be exact.
         """
         return self.pulse_m / float(np.sqrt(12.0)) if self.pulses.kind == "count" else 0.0
 

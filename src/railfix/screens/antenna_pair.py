@@ -4,10 +4,10 @@ The range from the rear antenna to a satellite is longer by ``L (cos el cos(az -
 gradient)``, with L the antenna spacing. A deviation from this difference indicates multipath at one of the two
 antennas, but not at which one.
 
-If `clocks` is "common", the receivers must share a clock: at epochs where the median pseudorange difference exceeds
-`SEPARATE_CLOCKS_M`, no satellite is tested (P1 6). If `clocks` is "median", the clock difference is estimated by the
-median over the satellites of a constellation. If range rates are given, the satellites' motion between the two time
-tags is removed (0.8 m in 1 ms at most).
+If `clocks` is "common", the receivers must share a clock: at epochs where the median over the satellites of the
+pseudorange difference exceeds `SEPARATE_CLOCKS_M`, no satellite is tested (P1 6). If `clocks` is "median", the clock
+difference is estimated by the median over the satellites of a constellation. If range rates are given, the satellites'
+motion between the two time tags is removed (0.8 m in 1 ms at most).
 
 Errors of gradient, sway and map make the elevation uncertain by 3 deg, and the azimuth relative to the car body by
 3.5 deg (P1). Multipath errors smaller than the effect of these angle errors are not detected.
@@ -41,7 +41,7 @@ from railfix.screens.pairs import PairedEpochs, PairScreen, on_pairs, pair_chann
 #: Descriptions of the treatment of the receiver clocks, for results.
 CLOCKS: Final = {
     "common": "the receivers' clocks are common by hardware",
-    "median": "the difference of the receivers' clocks is estimated by the median of each constellation",
+    "median": "the receivers' clock difference is the median pseudorange difference of each constellation",
 }
 #: Median pseudorange difference of all satellites [m] above which the receivers are assumed to have separate clocks.
 SEPARATE_CLOCKS_M: Final = 100.0
@@ -52,9 +52,9 @@ class AntennaPairLimits(Settings):
 
     #: Largest accepted deviation of the pseudorange difference from the expected difference; 5 in P1 table 6.
     limit_m: float = Field(default=5.0, gt=0.0, allow_inf_nan=False)
-    #: Largest assumed error of a satellite's elevation relative to the car body; 3 in P1 2.3(3).
+    #: Deviations that elevation errors (relative to the car body) up to this can explain are accepted; 3 in P1 2.3(3).
     elevation_error_deg: float = Field(default=3.0, ge=0.0, le=90.0)
-    #: Largest assumed error of a satellite's azimuth relative to the car body; 3.5 in P1 2.3(3).
+    #: Deviations that azimuth errors (relative to the car body) up to this can explain are accepted; 3.5 in P1 2.3(3).
     azimuth_error_deg: float = Field(default=3.5, ge=0.0, le=90.0)
     #: Both receivers share one clock ("common"), or a median removes the difference of their clocks ("median").
     clocks: Literal["common", "median"] = "median"

@@ -107,8 +107,8 @@ class AntennaSpacingScreen(PositionScreen[AntennaSpacingLimits]):
     ) -> Screened:
         """Return the metric and the verdict for pairs of filtered positions.
 
-        A pair is rejected where the positions or the speeds differ by more than their limit and by more than
-        `filter_sigmas` standard deviations.
+        A pair is rejected where the distance deviates from the spacing, or the speeds differ, by more than the limit
+        and by more than `filter_sigmas` standard deviations.
         """
         found = self.judge(front.chainage_m, rear.chainage_m, pair, limits)
         apart = np.abs(found.metric) > limits.filter_sigmas * np.hypot(front.sigma_m, rear.sigma_m)

@@ -110,7 +110,7 @@ class Cn0Screen(ObservationScreen[Cn0Limits]):
             "cn0_floor", "signal strength, floor", "C/N0 [dB-Hz]", "cn0_dbhz", Reason.CN0_FLOOR, "floor_dbhz", "below"
         ),
         ObservationPicture(
-            "cn0_curve", "signal strength against an open sky", "mean at the elevation minus C/N0 [dB]",
+            "cn0_curve", "C/N0 relative to open sky", "mean at the elevation minus measured C/N0 [dB]",
             "metric_cn0_deficit_dbhz", Reason.CN0_CURVE, "deficit_dbhz", "above",
         ),
     )  # fmt: skip

@@ -132,7 +132,7 @@ _NS: Final = 1e9
 
 @dataclass(frozen=True, kw_only=True)
 class DopplerScreened(Screened):
-    """Verdict of the Doppler screen; the metric is the change between two epochs as in P1 [m]; shapes (T, M)."""
+    """Verdict of the Doppler screen; the metric is code change minus Doppler change [m] (P1); shapes (T, M)."""
 
     #: Offset of a suspected pseudorange from its value before the jump; 0 if not suspected; NaN without a metric.
     level_m: Floats
@@ -303,7 +303,7 @@ class DopplerScreen(ObservationScreen[DopplerLimits]):
     columns = (
         ScreenColumn(
             name="metric_doppler_m",
-            meaning="screen `doppler`: pseudorange change since the previous epoch minus the change by Doppler",
+            meaning="screen `doppler`: pseudorange change since the previous epoch minus the Doppler-derived change",
             verdict="doppler",
         ),
         ScreenColumn(
@@ -315,7 +315,7 @@ class DopplerScreen(ObservationScreen[DopplerLimits]):
     )
     observation_pictures = (
         ObservationPicture(
-            "doppler", "pseudorange against Doppler", "change of the pseudorange minus Doppler [m]", "metric_doppler_m",
+            "doppler", "pseudorange against Doppler", "code change minus Doppler change [m]", "metric_doppler_m",
             Reason.DOPPLER, "limit_doppler_m",
         ),
     )  # fmt: skip

@@ -35,7 +35,7 @@ def _find_installed() -> list[Screen[Any]]:
         if not isinstance(screen, Screen):
             raise SettingsError(
                 f"the entry point {entry.name} of the package {package} (group {GROUP}) is {type(screen).__name__}, "
-                "expected a railfix.screens.Screen; correct or uninstall the package"
+                "but must be a railfix.screens.Screen; correct or uninstall the package"
             )
         if screen.name in (*_NAMES, *(other.name for other in found)):
             raise SettingsError(

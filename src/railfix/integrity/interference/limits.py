@@ -84,7 +84,7 @@ class InterferenceLimits(Settings):
     #: the noise of all channels equally; walls and roofs do not.
     spread_db: float = Field(default=1.5, gt=0)
     peak_decay_db_per_min: float = Field(default=1.0, gt=0)  #: Decay rate of each satellite's C/N0 peak.
-    known_after_s: float = Field(default=10.0, ge=0)  #: Tracking time from which a satellite's C/N0 is used.
+    known_after_s: float = Field(default=10.0, ge=0)  #: Falls of a satellite's C/N0 are used after this tracking time.
     #: Minimum fall of the front-end gain, as a fraction of its recent peak, that counts as a sign. At receiver
     #: start-up, the gain falls by up to 14 % without interference.
     gain_fall: float = Field(default=0.3, gt=0, lt=1)
@@ -102,13 +102,13 @@ class InterferenceLimits(Settings):
     #: Minimum estimated time-tag error that counts as a sign. For correct time tags, the estimated error reaches 0.05 s
     #: in towns, and 0.13 s with a phone and seven satellites.
     tag_error_s: float = Field(default=0.1, gt=0)
-    tag_sigmas: float = Field(default=6.0, gt=0)  #: As `tag_error_s`, in sigmas of the error.
+    tag_sigmas: float = Field(default=6.0, gt=0)  #: Time-tag errors below this many sigmas are no sign.
     #: If all positions fail a check for this time, this counts as a sign of interference.
     contradicted_s: float = Field(default=60.0, gt=0)
-    #: Minimum jump of clock drift, velocity and position in standard deviations. The same minimum applies to the
-    #: distance from the line, after `position_jump_m` is subtracted.
+    #: Jumps of clock drift, velocity and position by less than this many standard deviations are no sign. The limit
+    #: also applies to the distance from the line minus `position_jump_m`.
     jump_sigmas: float = Field(default=10.0, gt=0)
-    #: Minimum difference, in standard deviations, between the positions and clocks of two constellations.
+    #: Positions and clocks of two constellations that differ by at least this many sigmas count as a sign.
     part_sigmas: float = Field(default=15.0, gt=0)
     #: Largest acceleration of a train. Only the part of a change that this acceleration cannot explain is a jump.
     acceleration_mps2: float = Field(default=2.0, gt=0)
@@ -116,31 +116,30 @@ class InterferenceLimits(Settings):
     longest_gap_s: float = Field(default=10.0, gt=0)  #: Epochs further apart than this are not compared.
     largest_speed_sigma_mps: float = Field(default=2.0, gt=0)  #: Velocities with a larger sigma are not compared.
     largest_sigma_m: float = Field(default=30.0, gt=0)  #: Positions with a larger sigma are not compared.
-    #: Time for which a fall of C/N0 or gain, equal C/N0, or a position off the map must persist to be a sign.
+    #: Time for which a fall of C/N0 or gain, equal C/N0, or a deviation from map or wheel must persist to be a sign.
     hold_s: float = Field(default=3.0, gt=0)
     part_hold_s: float = Field(default=10.0, gt=0)  #: A difference of two constellations is a sign after this time.
-    #: Length of the window over which GNSS and wheel distances are compared.
-    wheel_window_s: float = Field(default=120.0, gt=0)
-    wheel_least_s: float = Field(default=60.0, gt=0)  #: Minimum length of a window that begins at a slip or a data gap.
-    wheel_m: float = Field(default=20.0, gt=0)  #: Minimum difference of GNSS and wheel distance that is a sign.
-    wheel_sigmas: float = Field(default=6.0, gt=0)  #: As `wheel_m`, in sigmas of the difference.
-    #: Whether the filter's protection level covers spoofing that slowly shifts the position along the track and that
-    #: the comparison with the wheel has not detected yet. With "on", the protection level is two to four times as
-    #: large.
+    wheel_window_s: float = Field(default=120.0, gt=0)  #: Window over which GNSS and wheel distances are compared.
+    wheel_least_s: float = Field(default=60.0, gt=0)  #: Shorter windows (after a slip or a data gap) are not compared.
+    wheel_m: float = Field(default=20.0, gt=0)  #: GNSS-wheel distance differences below this are no sign.
+    wheel_sigmas: float = Field(default=6.0, gt=0)  #: GNSS-wheel differences below this many sigmas are no sign.
+    #: Whether the filter's protection level covers slow spoofing along the track that the comparison with the wheel has
+    #: not detected yet. With "on", the protection level is two to four times as large.
     wheel_level: Literal["on", "off"] = "off"
-    #: With `wheel_level` on, the level is at least the GNSS-wheel distance difference plus this number of its sigmas.
-    #: The default is for a probability of 1e-7 that spoofing began within the window and an integrity risk of 1e-9.
+    #: With `wheel_level` on, the level is at least the GNSS-wheel distance difference plus this number of combined
+    #: sigmas of wheel distance and position at the window start. The default is for a probability of 1e-7 that spoofing
+    #: began within the window and an integrity risk of 1e-9.
     wheel_level_sigmas: float = Field(default=2.1, ge=0)
     #: Relative standard deviation of the wheel circumference before its estimation from positions.
     wheel_scale: float = Field(default=0.01, gt=0)
-    #: Relative standard deviation of later changes of the wheel circumference (creep).
+    #: Relative standard deviation of the change of the wheel circumference after its estimation (creep).
     wheel_change: float = Field(default=0.001, gt=0)
     #: Wheel acceleration above which a slip is assumed and the comparison restarts. Adhesion allows 1 to 1.5 m/s^2.
     wheel_acceleration_mps2: float = Field(default=1.6, gt=0)
-    #: Time for which suspected jamming, a time-tag error or a position off the map remains after its last sign.
+    #: Suspected jamming, time-tag errors and positions off the map stay reported for this time after the last sign.
     jamming_release_s: float = Field(default=10.0, ge=0)
-    #: Time for which suspected spoofing remains after its last sign. A jump is visible at one epoch only, but its cause
-    #: persists.
+    #: Suspected spoofing stays reported for this time after the last sign. A jump is visible at one epoch only, but the
+    #: cause of the jump persists.
     spoofing_release_s: float = Field(default=300.0, ge=0)
 
 
@@ -155,8 +154,8 @@ def suspicion(causes: Bits) -> Codes:
     """Return the `Suspicion` of each epoch from its signs.
 
     If several suspicions are possible, the first in a fixed order is returned. A time-tag error comes first, because it
-    displaces positions and clocks as a spoofer does. Spoofing precedes leaving the map, which explains neither jumps
-    nor equal C/N0.
+    displaces positions and clocks as a spoofer does. Spoofing comes before LEFT_MAP, because leaving the map explains
+    neither jumps nor equal C/N0.
     """
     order = (
         (Sign.TIME_TAGS, Suspicion.TIME_TAGS), (_SPOOFING, Suspicion.SPOOFING_SUSPECTED),
@@ -178,7 +177,7 @@ class HeldState:
     time: np.datetime64 = field(default_factory=lambda: _NEVER)  #: Time of the last epoch; NaT before the first.
     #: Time for which each condition has been continuously true, shape (C,).
     run_ns: Integers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    #: Time at which each condition was last active, shape (C,); NaT if never.
+    #: Last time at which each condition had been true for its holding time, shape (C,); NaT if never.
     last: Datetimes = field(default_factory=lambda: np.zeros(0, dtype="datetime64[ns]"))
 
 
@@ -210,8 +209,8 @@ def hold_signs(
 
 _MINUTE_S: Final = 60.0
 _GAIN_DECAY_PER_MIN: Final = 0.005  #: Relative decay of the gain peak per minute.
-_LARGEST_DBHZ: Final = 100.0  #: Decay after which a peak is dropped [dB].
-_LONGEST_SILENCE_S: Final = 60.0  #: Longest gap within a satellite's tracking [s].
+_LARGEST_DBHZ: Final = 100.0  #: A C/N0 peak that has decayed by this much is dropped [dB].
+_LONGEST_SILENCE_S: Final = 60.0  #: After a longer gap, a satellite's tracking time starts anew [s].
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,9 +18,9 @@ from railfix.integrity.interference.time_tags import NO_TAGS, TagErrors, fit_tim
 
 #: Step of the ranges when the receiver clock steps by 1 ms [m]. Receivers adjust their clocks by whole milliseconds.
 _MILLISECOND_M: Final = SPEED_OF_LIGHT * 1e-3
-#: Minimum number of redundant ranges or Dopplers of a fit. Fewer can agree by chance.
+#: Fits with fewer redundant ranges or Dopplers are not used, because so few can agree by chance.
 _LEAST_FREEDOM: Final = 3
-_LEAST_MPS: Final = 0.05  #: Minimum Doppler noise [m/s].
+_LEAST_MPS: Final = 0.05  #: Lower limit of the estimated Doppler noise [m/s].
 _SIZE: Final = 4  #: Number of unknowns of a single-constellation fit: position and clock.
 
 
@@ -77,9 +77,9 @@ class MotionSigns:
     speed_jump_sigmas: Floats
     position_jump_m: Floats
     position_jump_sigmas: Floats
-    #: Largest normalised difference between the positions and clocks of two constellations, shape (T,).
+    #: Largest difference of positions and clocks between any two constellations, in sigmas, shape (T,).
     part_sigmas: Floats
-    off_line_m: Floats  #: Distance of the 3-D position from the line, shape (T,); NaN until a position is on it.
+    off_line_m: Floats  #: 3-D position's distance from the line, shape (T,); NaN before the first position on the line.
     #: Excess of `off_line_m` over `InterferenceLimits.position_jump_m`, in standard deviations; shape (T,).
     off_line_sigmas: Floats
     tag_error_s: Floats  #: Median time-tag error of the last epochs, positive for late time tags; shape (T,).
@@ -87,12 +87,12 @@ class MotionSigns:
 
 
 class MotionFit(NamedTuple):
-    """Single-epoch fits at T epochs of one or several antennas."""
+    """Single-epoch fits at T epochs; the epochs can be from several antennas."""
 
     fixes: Fix
     part_sigmas: Floats  #: As `MotionSigns.part_sigmas`.
-    tag_error_s: Floats  #: Time-tag error, positive for late time tags, shape (T,); NaN if not redundant.
-    tag_sigma_s: Floats  #: Standard deviation of the time-tag error, shape (T,); NaN if not redundant.
+    tag_error_s: Floats  #: Time-tag error, positive for late time tags, shape (T,); NaN if undetermined.
+    tag_sigma_s: Floats  #: Sigma of the time-tag error, shape (T,); infinite if not significant, NaN if undetermined.
 
     def take(self, rows: slice) -> MotionFit:
         """Return the fits of selected epochs."""
@@ -195,7 +195,7 @@ def _position_jump(now: Fix, before: Fix, moving: Fix, limits: InterferenceLimit
     """Return the position jump in metres and in standard deviations, shape (T,).
 
     The jump is measured from the previous position, extrapolated with the previous velocity. If the previous velocity
-    is unknown, a train may have moved in any direction at its largest speed.
+    is unknown, a motion in any direction at the largest speed of a train is allowed.
     """
     dt = seconds(now.time - before.time)
     velocity = np.where((moving.time == before.time)[:, None], moving.velocity_mps[:, :3], np.nan)
@@ -211,7 +211,7 @@ def _position_jump(now: Fix, before: Fix, moving: Fix, limits: InterferenceLimit
 def _clock_jump(
     inputs: MotionInputs, state: MotionSignState, limits: InterferenceLimits
 ) -> tuple[Floats, tuple[Strings, Floats, Floats, Datetimes]]:
-    """Return `MotionSigns.clock_jump_m`, and each channel's name, last code, last range rate and their time."""
+    """Return `MotionSigns.clock_jump_m`, and the name, last code, last range rate and last time of each channel."""
     young = seconds(inputs.time[0] - state.since) <= limits.longest_gap_s
     joined = join_channels(inputs.channel, [state.channel], [young])
     code, rate = (joined.arrange(values, np.nan) for values in (state.code_m, state.rate_mps))

@@ -11,7 +11,7 @@ from railfix.core.constants import EARTH_ROTATION_RATE, SPEED_OF_LIGHT
 from railfix.positioning.search_index import SearchIndex
 
 _TURN: Final = EARTH_ROTATION_RATE / SPEED_OF_LIGHT
-_RIDGE: Final = 1e-9  #: Weight of a loose prior on the unknowns, for conditioning.
+_RIDGE: Final = 1e-9  #: Weight of a loose prior on each unknown, for numerical conditioning.
 
 
 class MotionInputs(NamedTuple):
@@ -29,13 +29,13 @@ class MotionInputs(NamedTuple):
     corrected_code_m: Floats  #: Corrected pseudoranges, shape (T, K).
     sigma_m: Floats  #: Standard deviations of the corrected pseudoranges, shape (T, K).
     used: Masks  #: Channels without a rejection reason, shape (T, K).
-    named: Masks  #: Channels rejected only because their own satellite is faulty, shape (T, K).
+    named: Masks  #: Channels whose only rejection reason is a fault of their satellite, shape (T, K).
     noise_scale: Floats  #: Ratio of the receiver's range standard deviation to `sigma_m`, shape (T,).
     clock_offset_m: Floats  #: Known offsets of the receiver clocks, shape (T, G).
     clock_sigma_m: Floats  #: Standard deviations of the clock offsets, shape (T, G).
     #: Lateral distance of the 3-D position from the line, shape (T,); NaN beyond an end of the line.
     off_line_m: Floats
-    #: True where codes are faulty or the position failed a check, shape (T,).
+    #: True for epochs with faulty codes or with a position that failed a check, shape (T,).
     doubted: Masks
     antenna: Indices  #: Index of each epoch's antenna in `lines`, shape (T,).
     lines: tuple[SearchIndex, ...]  #: Line of each antenna.

@@ -18,20 +18,20 @@ from railfix.integrity.interference.range_fits import MotionInputs, clock_column
 
 #: Scale of the design column of the time-tag error: order of magnitude of a satellite's range rate [m/s].
 _RATE_MPS: Final = 500.0
-_TAG_EPOCHS: Final = 10  #: Largest number of epochs in the median time-tag error.
+_TAG_EPOCHS: Final = 10  #: The median time-tag error is computed from at most this number of epochs.
 _TAG_LEAST: Final = 3  #: Minimum number of epochs required for the median time-tag error.
 _TAG_WINDOW: Final = np.timedelta64(60, "s")  #: Epochs older than this are not used in the median time-tag error.
 _STEPS: Final = 6  #: Largest number of iterations of a fit.
 _SETTLED_S: Final = 0.05  #: Change of the time-tag error below which the iteration ends [s].
 _SETTLED_M: Final = 100.0  #: Change of the position below which the iteration ends [m].
 _ROUNDS: Final = 2  #: Number of reweighted fits per iteration.
-_FITS_WELL: Final = 3.0  #: Residuals up to this multiple of their median have full weight.
+_FITS_WELL: Final = 3.0  #: Absolute residuals up to this multiple of their median have full weight.
 _SHOWN: Final = 3.0  #: Time-tag errors above this many sigmas are fitted again, constrained to the line.
 _NEAR_LINE_M: Final = 20.0  #: Standard deviation of the line constraint, lateral and vertical [m].
-_LEAST_FREEDOM: Final = 3  #: Minimum redundancy of a fit to the rows that agree with a time-tag error.
+_LEAST_FREEDOM: Final = 3  #: A time-tag error is rejected if the rows that agree with it have less redundancy.
 #: Residuals below this many standard deviations agree with a fit. The cost function clips residuals at this limit.
 _AGREES: Final = 5.0
-#: Minimum reduction of the cost by an accepted time-tag error. It exceeds the cost of one clipped residual (25),
+#: A time-tag error is rejected if it reduces the cost by less. The limit exceeds the cost of one clipped residual (25),
 #: because a time-tag error can absorb one faulty code.
 _CLEARLY_LESS: Final = 36.0
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.
@@ -55,7 +55,7 @@ class _TagFit(NamedTuple):
     error_s: Floats  # (T,), positive for late tags
     sigma_s: Floats  # (T,)
     place_ecef_m: Floats  # (T, 3)
-    residual: Floats  # (T, K + 2), normalised; the two rows of the line last
+    residual: Floats  # (T, K + 2), absolute, normalised; the last two are of the line constraint
 
 
 def fit_time_tags(inputs: MotionInputs) -> tuple[Floats, Floats]:
@@ -94,7 +94,7 @@ def _explains_more(inputs: MotionInputs, with_error: Floats, without: Floats) ->
 def _fit(
     inputs: MotionInputs, counted: Masks, late_s: Floats, place_ecef_m: Floats, *, tags: bool, line: bool
 ) -> _TagFit:
-    """Fit positions to `counted` codes (T, K); estimate a time-tag error if `tags`; constrain to the line if `line`."""
+    """Fit positions to the codes in `counted` (T, K), optionally with a time-tag error and a line constraint."""
     rows, late, place = np.arange(len(late_s)), late_s.copy(), place_ecef_m.copy()
     sigma, residual = np.full(len(rows), np.nan), np.full((len(rows), counted.shape[1] + 2), np.nan)
     for _ in range(_STEPS):

@@ -16,11 +16,9 @@ from railfix.core.arrays import Datetimes, Floats, Integers, Masks, RowArrays, j
 from railfix.core.timescale import GPS_EPOCH, seconds, timedelta
 from railfix.integrity.interference.limits import HeldState, InterferenceLimits, hold_signs
 
-#: Standard deviation of satellite and atmospheric errors that change over minutes [m].
-_LEAST_M: Final = 1.0
-#: Speed below which a tachometer may have no output [m/s].
-_SLOW_MPS: Final = 0.5
-#: Interval between compared positions, and largest time by which a time tag may precede the whole second.
+_LEAST_M: Final = 1.0  #: Standard deviation of satellite and atmospheric errors that change over minutes [m].
+_SLOW_MPS: Final = 0.5  #: Speed below which a tachometer may have no output [m/s].
+#: Compared positions are a second apart. Time tags up to 5 ms before a whole second count as that second.
 _SECOND, _TAG = np.timedelta64(1, "s"), np.timedelta64(5, "ms")
 
 
@@ -50,7 +48,7 @@ class WheelState:
     doubt_m: float = 0.0  #: `WheelSamples.doubt_m` at the last epoch.
     speed_mps: float = float("nan")  #: Last known wheel speed; NaN if none.
     part: int = 0  #: Number of the current part.
-    second: int = -1  #: GPS second of the last epoch.
+    second: int = -1  #: GPS second of the last epoch; -1 before the first epoch.
     held: HeldState = field(default_factory=HeldState)
     difference_m: float = float("nan")  #: `WheelSigns.difference_m` at the last sample.
     bound_m: float = float("nan")  #: `WheelSigns.bound_m` at the last sample.
@@ -66,7 +64,7 @@ class WheelSigns:
     #: Bound of the position error caused by spoofing that began within the window, shape (T,): absolute difference plus
     #: `wheel_level_sigmas` times the combined standard deviation of wheel distance and position at the window start.
     bound_m: Floats
-    #: True where the difference exceeds its limits, or exceeded them within the release time; shape (T,).
+    #: True where the difference has exceeded its limits for `hold_s`, or did so within the release time; shape (T,).
     parted: Masks
 
 

@@ -69,7 +69,7 @@ class AraimGeometry:
     sigma_acc_m: Floats  #: Accuracy standard deviations, shape (T, N); NaN for unused observations.
     bias_m: Floats  #: Largest nominal bias of each observation, shape (T, N).
     prior: Floats  #: Prior probability of a fault of each single observation, shape (N,).
-    together: Masks  #: Sets of observations affected by a constellation or map fault, shape (C, N).
+    together: Masks  #: True for observations that each constellation or map fault affects, shape (C, N).
     together_prior: Floats  #: Prior probability of each constellation or map fault, shape (C,).
 
     @property

@@ -1,4 +1,4 @@
-"""Search for possible true positions that the protection level does not cover, where the line leaves its tangent.
+"""Search, where the line leaves its tangent, for possible true positions that the protection level does not cover.
 
 A protection level bounds the error along the tangent. Where the line bends or passes close to itself, the true position
 can be on the line but away from the tangent. Under each fault hypothesis, the sum of squared residuals is a quadratic
@@ -116,7 +116,7 @@ def _risk_of_block(index: SearchIndex, arc_m: Floats, level_m: Floats, forms: Fo
 def _around(
     index: SearchIndex, arc_m: Floats, level_m: Floats, radius_m: Floats
 ) -> tuple[Indices, Floats, Floats, Floats, Floats]:
-    """Return the line sections within `radius_m` of each position, split at the distance `level_m`, by epoch.
+    """Return, for each epoch, the line sections within `radius_m` of the position, split at the distance `level_m`.
 
     Returns
     -------

@@ -29,7 +29,7 @@ from railfix.integrity.raim import LinearModel
 
 #: Probability that a satellite is faulty at a given time: 1e-5 for GPS (one-hour faults at a rate of 1e-5 per hour),
 #: and 3e-5 for Galileo (EU-U.S. Working Group C, ARAIM Technical Subgroup, Milestone 3 report, and the later Galileo
-#: service definition). Other constellations have the Galileo value, because their commitments are more recent.
+#: service definition). Other constellations have the Galileo value, because they committed themselves later than GPS.
 SATELLITE_PRIOR: Final[Mapping[str, float]] = MappingProxyType(
     {"G": 1e-5, "J": 3e-5, "E": 3e-5, "C": 3e-5, "R": 3e-5, "S": 3e-5, "I": 3e-5}
 )
@@ -63,15 +63,15 @@ class RiskBudget(Settings):
     #: Number of independent samples in an hour: 3600 s divided by the correlation time of the errors. The default
     #: assumes a correlation time of 10 s. Multipath changes within seconds on a moving train and within tens of seconds
     #: at standstill, SBAS corrections within minutes (DO-229D appendix J: 10 samples per hour). A larger number is
-    #: conservative: the fault-free K for 3600 samples is 0.9 larger than for 10.
+    #: conservative: the fault-free K for 3600 samples is 0.9 larger than for 10 samples.
     samples_per_hour: float = Field(default=360.0, gt=0, allow_inf_nan=False)
     #: Fractions of an epoch's risk for no, one and two faults; their sum is at most 1. A level is computed for each.
-    #: The largest is lowered until the sum of all tail probabilities equals the sum of the three risks. Doubling a
-    #: fraction lowers a K of 6 by only 0.1 and a K of 3 by only 0.2, so the defaults are equal.
+    #: The largest level is lowered until the sum of all tail probabilities equals the sum of the three risks. Doubling
+    #: a fraction lowers a K of 6 by only 0.1 and a K of 3 by only 0.2, so the defaults are equal.
     fault_free_share: float = Field(default=1.0 / 3.0, gt=0)
     one_fault_share: float = Field(default=1.0 / 3.0, gt=0)
     two_fault_share: float = Field(default=1.0 / 3.0, gt=0)
-    #: Fraction of the risk for faults that no hypothesis covers. If their probability exceeds it, more faults become
+    #: Fraction of the risk for faults that no hypothesis covers. If these faults are more probable, more faults become
     #: hypotheses, with up to four satellites and three shared faults (constellation, side, map) at the same time.
     unchecked_share: float = Field(default=0.3, gt=0, lt=1)
     #: Fraction of the risk for epochs with one excluded satellite; epochs with two have an equal fraction.
@@ -93,9 +93,9 @@ class RiskBudget(Settings):
     side_prior: float = Field(default=SUPPORTED_SIDE_PRIOR, ge=0, lt=1)
     #: Elevation up to which satellites count as low. A wall whose distance equals its height reaches 45 deg.
     side_elevation_deg: float = Field(default=45.0, gt=0, le=90.0)
-    #: Satellites assumed to be faulty together. With "beside", these are the low satellites left or right of the track.
-    #: With "all", as in the filter, these are also all satellites ahead or behind; levels are then up to three times as
-    #: large, because single-epoch geometry along the track is weak without the satellites ahead or behind.
+    #: Sets of satellites that may be faulty together. With "beside", these are the low satellites left, and right, of
+    #: the track. With "all", as in the filter, the satellites ahead and behind are two more sets. Levels are then up to
+    #: three times as large, because single-epoch geometry along the track is weak without one of these two sets.
     late_sides: Literal["beside", "all"] = "beside"
     #: Whether the priors were measured on this line (``railfix error-model``). If they are assumed, every output calls
     #: the levels indicative, and no hourly risk is claimed. "measured" requires `local_prior` and `side_prior`.
@@ -108,7 +108,7 @@ class RiskBudget(Settings):
     def _shares_up_to_one(self) -> Self:
         shares = (self.fault_free_share, self.one_fault_share, self.two_fault_share)
         if sum(shares) > 1.0 + 1e-12:
-            raise ValueError(f"the three fractions must add up to 1 at most, got {shares}")
+            raise ValueError(f"the sum of the three fractions must not exceed 1, got {shares}")
         return self
 
     @model_validator(mode="after")
@@ -116,8 +116,8 @@ class RiskBudget(Settings):
         missing = [name for name in ("local_prior", "side_prior") if name not in self.model_fields_set]
         if self.priors == "measured" and missing:
             raise ValueError(
-                f"priors are measured, but {' and '.join(missing)} not given: state what railfix error-model prints, "
-                "or leave priors assumed (levels are called indicative)"
+                f'priors = "measured" requires {" and ".join(missing)}: set what railfix error-model prints, '
+                'or set priors = "assumed" (levels are then called indicative)'
             )
         return self
 
@@ -128,7 +128,7 @@ class RiskBudget(Settings):
 
     @property
     def sample_k(self) -> float:
-        """Two-sided factor K of a level without fault hypotheses, which uses the whole risk of a sample."""
+        """Two-sided factor K of a level without fault hypotheses, to which the whole risk of a sample is allocated."""
         return k_factor(self.risk_per_sample)
 
     def prior(self, systems: Sequence[str]) -> Floats:
@@ -142,7 +142,7 @@ class RiskBudget(Settings):
         return np.array([self.satellite_prior[s] + self.local_prior for s in systems], dtype=np.float64)
 
     def sample_risk(self, n_used: ArrayLike, n_excluded: ArrayLike, beyond: ArrayLike = 0.0) -> Floats:
-        """Return the integrity risk of epochs, allocated to the satellites that remain after exclusions.
+        """Return the part of each epoch's integrity risk for the satellites that remain after exclusions.
 
         `beyond` is the probability of unchecked faults, which is first subtracted from the risk. Any e satellites could
         have been excluded, so the risk for e exclusions is divided by the number of sets of e satellites. The result is
@@ -180,9 +180,8 @@ def set_sums(prior: Floats, most: int) -> Floats:
 #: Largest number of shared faults in a hypothesis. The probability of more shared faults is subtracted from the risk.
 _MOST_SHARED: Final = 3
 FEW: Final = 2  #: Allocations of at most this number of epochs are cached. A live chunk has one epoch per antenna.
-#: Number of cached allocations. They are used again when obstructed satellites reappear.
-REMEMBERED: Final = 512
-_MOST_SETS: Final = 46_376  #: Largest number of hypotheses in a class: four of 34 satellites.
+REMEMBERED: Final = 512  #: Number of cached allocations. They are used again when obstructed satellites reappear.
+_MOST_SETS: Final = 46_376  #: Largest number of hypotheses in a class: all sets of four of 34 satellites.
 
 
 class Shared(NamedTuple):
@@ -222,11 +221,11 @@ def allocate(
 ) -> Allocation:
     """Choose the fault hypotheses of each epoch and divide the risk among them.
 
-    Faults of one satellite, a side, a constellation and the map are always hypotheses, the last two also together with
-    one faulty satellite. Pairs of satellites are hypotheses where their probability exceeds the risk allocated to two
-    faults. The most probable other classes are added until the remaining classes are within the risk for unchecked
-    faults. `out`, shape (T,), is the number of excluded satellites. `sides`, shape (T, S, M), are the sets of
-    satellites that may be faulty together.
+    Faults of one satellite, a side, a constellation or the map are hypotheses wherever their prior is positive. So is a
+    constellation or map fault together with a faulty satellite. Pairs of satellites are hypotheses where their
+    probability exceeds the risk allocated to two faults. The most probable other classes are added until the remaining
+    classes are within the risk for unchecked faults. `out`, shape (T,), is the number of excluded satellites. `sides`,
+    shape (T, S, M), are the sets of satellites that may be faulty together.
     """
     used = model.used
     sides = sides & used[:, None]
@@ -272,7 +271,7 @@ def _allocate(
 ) -> Allocation:
     of_channel = risk.prior(systems)
     prior = used * of_channel
-    # Excluded satellites may be faulty, too, and have the largest prior.
+    # Excluded satellites may be faulty, too; each is given the largest prior of all channels.
     everyone = np.concatenate([prior, (np.arange(MOST_EXCLUDED) < out[:, None]) * of_channel.max(initial=0.0)], axis=1)
     letters = [s for s in dict.fromkeys(systems) if risk.constellation_prior.get(s, 0.0) > 0.0]
     of_letter = np.array([[t == s for t in systems] for s in letters], dtype=bool).reshape(len(letters), len(systems))

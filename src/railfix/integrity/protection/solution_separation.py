@@ -31,7 +31,7 @@ from railfix.integrity.protection.risk import FEW, MOST_TOGETHER, REMEMBERED, Al
 from railfix.integrity.raim import LinearModel
 
 _BLOCK_SIZE: Final = 200_000  #: Largest number of elements of a block's hypothesis arrays.
-_OF_MORE: Final = 3  #: Index of the part for three or more faults.
+_OF_MORE: Final = 3  #: Index of the risk part for three or more faults.
 
 
 class Cause(IntEnum):
@@ -74,13 +74,13 @@ class ProtectionLevel(NotebookTable):
     #: Protection level, shape (T,), at which the tail probabilities add up to at most the risk. If infinite, see
     #: `cause`.
     level_m: Floats
-    #: Separate levels for no fault, one fault and two faults, shape (T,). A part is 0 if the total probability of its
+    #: Separate levels for no fault, one fault and two faults, shape (T,). A level is 0 if the total probability of its
     #: hypotheses is within the risk allocated to it.
     fault_free_m: Floats
     one_fault_m: Floats
     two_fault_m: Floats
     sigma_m: Floats  #: Fault-free standard deviation of the position along the track, shape (T,).
-    #: Factor K of each part, shape (T,); -inf where the part is 0.
+    #: Factor K of each of these three levels, shape (T,); -inf where the level is 0.
     k_fault_free: Floats
     k_one_fault: Floats
     k_two_faults: Floats
@@ -88,17 +88,17 @@ class ProtectionLevel(NotebookTable):
     separation: Floats  #: Largest ``|x_J - x|/T_J`` of all J, shape (T,); 0 where no position x_J exists.
     #: True where the separation is at most 1, shape (T,). Where False, the protection level is invalid.
     consistent: Masks
-    #: Channel whose fault determines `one_fault_m`, shape (T,); -1 if another fault does.
+    #: Channel whose fault determines `one_fault_m`, shape (T,); -1 if the fault is not of a satellite.
     worst_one: Indices
-    worst_two: Indices  #: Channels whose faults determine `two_fault_m`, shape (T, 2); -1 if other faults do.
-    #: Constellation whose fault determines `one_fault_m`, shape (T,); empty if another fault does.
+    worst_two: Indices  #: Channels whose faults determine `two_fault_m`, shape (T, 2); -1 for other faults.
+    #: Constellation whose fault determines `one_fault_m`, shape (T,); empty if the fault is not of a constellation.
     worst_constellation: Strings
     unchecked_risk: Floats  #: Probability of faults that no hypothesis covers, subtracted from the risk, shape (T,).
     cause: Codes  #: `Cause` of each epoch, shape (T,).
 
 
 class RangeBounds(NamedTuple):
-    """Paired overbound: smallest standard deviation and largest bias of each range, shape (T, M) or (M,) [m]."""
+    """Paired overbound: lower limit of the sigma, and largest bias, of each range, shape (T, M) or (M,) [m]."""
 
     sigma_m: ArrayLike | None = None
     bias_m: ArrayLike | None = None
@@ -107,7 +107,7 @@ class RangeBounds(NamedTuple):
 class MapDeviation(NamedTuple):
     """Lateral and vertical map error in addition to the map sigmas."""
 
-    bias_m: ArrayLike = 0.0  #: Map offset not covered by the map sigmas, shape (T, 2) or (2,).
+    bias_m: ArrayLike = 0.0  #: Map offset that the map sigmas do not cover, shape (T, 2) or (2,).
     #: Lateral and vertical offset of the 3-D position from the map, shape (T, 2) [m], and the inverse covariance of the
     #: offset, shape (T, 2, 2) [1/m^2] (0 if unknown). If present, a wrong map is a hypothesis.
     seen: tuple[Floats, Floats] | None = None
@@ -146,15 +146,15 @@ def protection_level(
     Raises
     ------
     ValueError
-        The model is not on the line, the noise scale is not positive, `systems` does not name each channel, or the
-        model uses an excluded satellite.
+        The model is not of positions on the line, the noise scale is not positive, `systems` does not have one letter
+        per channel, or the model uses an excluded satellite.
     """
     if model.interest != 1:
-        raise ValueError("a level along the track needs a model on the line (linear_model)")
+        raise ValueError("a level along the track requires a model of positions on the line (linear_model)")
     risk, overbound, map_error = risk or RiskBudget(), overbound or RangeBounds(), map_error or MapDeviation()
     epochs, channels = model.root_weight.shape
     if len(systems) != channels:
-        raise ValueError(f"systems must name each channel: {channels} channels, got {len(systems)}")
+        raise ValueError(f"systems must have one letter per channel: {channels} channels, got {len(systems)}")
     scale = _broadcast(np.asarray(scale, dtype=np.float64), (epochs,))
     if (scale <= 0).any():
         raise ValueError("the noise scale must be positive")

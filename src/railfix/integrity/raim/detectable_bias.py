@@ -32,11 +32,12 @@ _BLOCK_SIZE: Final = 40_000  #: Largest number of elements of a block's array of
 class Reliability:
     """Reliability of the chi-square test at T epochs with M channels."""
 
-    noncentrality: Floats  #: Noncentrality lambda of the smallest detectable fault, shape (T,); NaN if not testable.
+    #: Noncentrality lambda of faults missed with the probability `missed_detection`, shape (T,); NaN if untestable.
+    noncentrality: Floats
     #: Range error that the test misses with the probability `missed_detection`, shape (T, M); infinite for ranges that
     #: no other range tests, NaN for unused ranges.
     minimal_detectable_bias_m: Floats
-    #: Position error per unit of the statistic's square root, shape (T, M); NaN for unused channels.
+    #: Position error per unit of the statistic's square root, shape (T, M); infinite if undetectable, NaN if unused.
     slope_m: Floats
     #: Largest slope for simultaneous errors of two satellites, shape (T,); only if `RaimLimits.faults` is 2, else NaN.
     pair_slope_m: Floats
@@ -80,7 +81,7 @@ def reliability(model: LinearModel, *, limits: RaimLimits | None = None, scale: 
         largest = np.fmax(largest, pair)
     # without redundancy, a fault of any size is undetected
     fault = np.where(located & (model.freedom < 1), np.inf, largest * root)
-    # K: two-sided Gaussian along the line, Rayleigh with the longest axis (an upper bound) in the plane
+    # K: two-sided Gaussian factor on the line; in the plane, Rayleigh factor of the longest axis (an upper bound)
     risk = limits.noise_risk
     noise = sigma * (
         float(-scipy.special.ndtri(risk / 2.0)) if model.interest == 1 else math.sqrt(-2.0 * math.log(risk))
@@ -102,7 +103,7 @@ def reliability(model: LinearModel, *, limits: RaimLimits | None = None, scale: 
 
 
 def noncentrality(freedom: ArrayLike, *, limits: RaimLimits | None = None) -> Floats:
-    """Return the noncentrality that the chi-square test misses with the probability `missed_detection` (P4).
+    """Return the noncentrality of a fault that the chi-square test misses with probability `missed_detection` (P4).
 
     The result has the shape of `freedom` and is NaN below 1 degree of freedom.
     """
@@ -181,8 +182,8 @@ def _pair_block(model: LinearModel, sigma: Floats) -> Floats:
     largest = _largest_eigenvalue(entry(0, 0), entry(0, 1), entry(1, 1)) if wide else entry(0, 0)
     squared = np.where(regular, largest / np.where(regular, determinant, 1.0), 0.0)
 
-    # If the pair is not regular, errors proportional to (sqrt c, -+ sqrt a) do not appear in the residuals. If they do
-    # not change the position either, the slope of the pair is at most the larger single slope.
+    # If S_EE is singular, errors proportional to (sqrt c, -+ sqrt a) do not appear in the residuals. If they do not
+    # change the position either, the slope of the pair is at most the larger single slope.
     x, y = np.sqrt(np.maximum(c, 0.0)), -np.copysign(np.sqrt(np.maximum(a, 0.0)), b)
     hidden = np.linalg.norm(x[..., None] * first + y[..., None] * second, axis=2)
     blind = both & ~regular & (hidden > _NO_EFFECT * sigma[:, None] * np.hypot(x, y))

@@ -29,11 +29,11 @@ _TABLE_STEP: Final = 64  #: The number of thresholds in a table is a multiple of
 class RaimLimits(Settings):
     """Limits of fault detection, fault exclusion and reliability."""
 
-    mode: Literal["chi_square", "fixed"] = "chi_square"  #: Threshold from `false_alarm` (P4), or fixed (P1).
+    mode: Literal["chi_square", "fixed"] = "chi_square"  #: Threshold from `false_alarm` (P4) or `fixed_limit_m2` (P1).
     #: Probability that noise alone is detected as a fault; 0.001 in P4. In mode "chi_square", the error of an excluded
     #: satellite must also be significant at this probability.
     false_alarm: float = Field(default=1e-3, gt=0, lt=1)
-    #: Probability of missing a fault of the minimal detectable size. P4 states no value.
+    #: Probability with which the minimal detectable fault is missed. P4 states no value.
     missed_detection: float = Field(default=1e-3, gt=0, lt=1)
     #: In mode "fixed", limit of the sum of squared residuals, and lower limit of an excluded satellite's squared error;
     #: P1 table 6 ("FDE 2 SAT, 100 m2").
@@ -43,7 +43,7 @@ class RaimLimits(Settings):
     min_redundancy: int = Field(default=1, ge=1)  #: Minimum degrees of freedom that remain after an exclusion.
     #: Probability that noise alone makes the WSSE of the correct exclusion exceed the WSSE of a competing exclusion by
     #: more than the separation (chi-square, one degree of freedom). An epoch is inseparable if another exclusion of as
-    #: many satellites passes and its WSSE is larger by less than the separation.
+    #: many satellites passes and its WSSE exceeds the smallest WSSE by less than the separation.
     separation_risk: float = Field(default=1e-3, gt=0, le=1)
     #: Exclusions do not compete if their positions are closer than this distance, because the choice hardly changes the
     #: position (for example, between two satellites that alone share a clock). With 0, exclusions always compete.
@@ -51,8 +51,7 @@ class RaimLimits(Settings):
     #: Two-sided probability that the position noise exceeds the noise part K sigma of the protection level. A value of
     #: 1 means K = 0, as in ``HSlope sigma0 sqrt(lambda)`` of P4.
     noise_risk: float = Field(default=1e-3, gt=0, le=1)
-    #: Alarm limit of the protection level. P4 accepts an error within a car length, 20 m.
-    alarm_limit_m: float = Field(default=20.0, gt=0)
+    alarm_limit_m: float = Field(default=20.0, gt=0)  #: Alarm limit of the level. P4 accepts a car length, 20 m.
     faults: int = Field(default=1, ge=1, le=2)  #: Number of simultaneous faults covered by the level; 1 in P4.
 
     @model_validator(mode="after")
@@ -63,7 +62,7 @@ class RaimLimits(Settings):
 
     @cached_property
     def separation(self) -> float:
-        """Minimum difference between the WSSEs of two competing exclusions, in noise variances."""
+        """Difference between the WSSEs of two exclusions below which an epoch is inseparable, in noise variances."""
         return float(scipy.special.chdtri(1, self.separation_risk))
 
     @cached_property
@@ -147,8 +146,7 @@ def _chi_square_table(false_alarm: float, size: int) -> Floats:
 
 
 _ROUNDING: Final = 1e-9  #: Relative difference within which two WSSE count as equal.
-#: Largest number of elements of a block's array, so that the array fits into the cache of a core.
-_BLOCK_SIZE: Final = 40_000
+_BLOCK_SIZE: Final = 40_000  #: Largest number of elements of a block's array; the array fits into the cache of a core.
 
 
 class Outcome(IntEnum):
@@ -174,9 +172,11 @@ class Exclusion:
 
     outcome: Codes  #: `Outcome`, shape (T,).
     excluded: Masks  #: True for excluded channels, shape (T, M).
-    #: Channels of the passing exclusion with the smallest statistic, shape (T, 2), even if INSEPARABLE; -1: none.
+    #: Channels of the passing exclusion with the smallest statistic, even at inseparable epochs, shape (T, 2). The
+    #: second is -1 for a single channel; both are -1 if no exclusion passes.
     best: Indices
-    #: Channels of the closest competing exclusion, of as many channels, shape (T, 2); -1 for none.
+    #: Channels of the next best passing exclusion of as many channels, shape (T, 2); -1 as for `best`. At inseparable
+    #: epochs, only competing exclusions are considered.
     alternative: Indices
     #: Range error of each channel of `best`, positive if the range is too long, shape (T, M); NaN for other channels.
     own_error_m: Floats
@@ -205,10 +205,10 @@ def exclude(model: LinearModel, *, limits: RaimLimits | None = None, scale: Arra
     """Detect faults, and exclude a single satellite or a pair from each faulty epoch.
 
     A subset can be excluded if the remaining ranges pass with at least `min_redundancy` degrees of freedom. In
-    addition, the error of each excluded satellite must exceed the noise, or ``sqrt(fixed_limit_m2)`` in mode "fixed".
-    Single satellites are preferred to pairs. Of several subsets, the one with the smallest statistic is excluded. The
-    epoch is inseparable if another subset of equal size could also be excluded and noise can explain the difference
-    between the statistics (`separation_risk`). `scale` is the noise scale (see `detect`).
+    addition, the error of each excluded satellite must be significant (`false_alarm`) or, in mode "fixed", exceed
+    ``sqrt(fixed_limit_m2)``. Single satellites are preferred to pairs. Of several subsets, the one with the smallest
+    statistic is excluded. The epoch is inseparable if another subset of equal size could also be excluded and noise can
+    explain the difference between the statistics (`separation_risk`). `scale` is the noise scale (see `detect`).
     """
     limits = limits or RaimLimits()
     epochs, channels = model.root_weight.shape
@@ -265,7 +265,7 @@ def _singles(parts: Compact, wsse: Floats, scale: Floats, limits: RaimLimits) ->
     drop = parts.residual * own
     if limits.mode == "chi_square":
         statistic = (wsse[:, None] - drop) / scale[:, None] ** 2
-        over = drop > limits.own_error * scale[:, None] ** 2  # own^2 over its variance 1/S_ii
+        over = drop > limits.own_error * scale[:, None] ** 2  # `drop` is own^2 divided by its variance 1/S_ii
     else:
         total, linear, square = _sum_squares(parts)
         statistic = total[:, None] - 2.0 * own * linear + own**2 * np.einsum("tii->ti", square)

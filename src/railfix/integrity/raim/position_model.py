@@ -55,7 +55,7 @@ class LinearModel:
     #: Position covariance Q, computed with the prior, shape (T, 3, 3); NaN where the position is undetermined.
     covariance_m2: Floats
     prior: Floats  #: Prior information P on the position, from the map sigmas, shape (3, 3) [1/m^2].
-    #: Whitened code minus distance (y), which contains the clock, shape (T, M); 0 for unused ranges.
+    #: Whitened code minus distance (y), including the receiver clock, shape (T, M); 0 for unused ranges.
     misfit: Floats
     freedom: Integers  #: Degrees of freedom: ranges minus unknowns, shape (T,); may be negative.
     interest: int  #: Number of components of interest: 1 on the line, 2 in space (horizontal).
@@ -121,7 +121,7 @@ class LinearModel:
 
     @cached_property
     def wsse(self) -> Floats:
-        """Weighted sum of squared residuals ``y^T S y``, including map error and known clock offsets, shape (T,)."""
+        """Weighted sum of squared residuals ``y^T S y``, with map and clock-offset terms, shape (T,)."""
         return np.asarray(np.einsum("tm,tm->t", self.misfit, self.residual))
 
     @cached_property
@@ -150,7 +150,7 @@ class Compact(RowArrays):
     projector: Floats  #: Residual projector S, shape (T, n, n); 0 for unused channels.
     residual: Floats  #: Whitened residuals, shape (T, n).
     sigma_m: Floats  #: Standard deviations of the ranges, shape (T, n); 0 for unused channels.
-    gain_m: Floats  #: `LinearModel.gain_m`, shape (T, n, interest).
+    gain_m: Floats  #: Gain of each channel (`LinearModel.gain_m`), shape (T, n, interest).
 
 
 def compact(model: LinearModel) -> Compact:
