@@ -173,7 +173,7 @@ def _turned(samples: SensorSamples, sensor: str, column: str, factor: object) ->
         ("inertial", "force_mps2", [-1.0, -1.0, 1.0], "inertial: the forward force is opposite"),
         ("inertial", "force_mps2", 1.0 / 9.80665, "inertial: its forces are in g"),
         ("inertial", "force_mps2", [1.0, 1.0, -1.0], r"force_down_mps2 is \+9.8 on average"),
-        ("inertial", "force_mps2", [1.0, 1.0, 0.5], "inertial: its mean force is 4.9"),
+        ("inertial", "force_mps2", [1.0, 1.0, 0.5], "inertial: its median force is 4.9"),
         ("inertial", "rate_radps", -1.0, "inertial: its yaw rate is opposite"),
         ("inertial", "rate_radps", 57.29578, "inertial: its rates are in degrees"),
     ],

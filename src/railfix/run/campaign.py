@@ -44,7 +44,7 @@ class Campaign(Settings):
     """
 
     #: Pattern of the logs of the front antenna, such as ``logs/{train}/{day}/front.obs*``. Logs whose fields have the
-    #: same values are one run; several files of one antenna are joined in the order of their names.
+    #: same values belong to one run; several files of one antenna are joined in the order of their names.
     front: str
     nav: str  #: Pattern of navigation files.
     track: tuple[str, ...]  #: Patterns of the files of the track, which are joined to a route in this order.
@@ -250,7 +250,7 @@ def _row(run: CampaignRun, **values: Any) -> dict[str, Any]:
 def _find(folder: Path, pattern: str) -> list[tuple[Path, dict[str, str]]]:
     """Return the files that match a pattern, each with the values of its fields, in order of their names.
 
-    A pattern with neither fields nor ``*`` is returned even if there is no such file; the run then reports the error.
+    The path of a pattern with neither fields nor ``*`` is returned even if the file is missing; the run reports this.
     """
     if not pattern:
         return []
@@ -271,7 +271,7 @@ def _find(folder: Path, pattern: str) -> list[tuple[Path, dict[str, str]]]:
 
 
 def _regex(part: str, seen: set[str]) -> str:
-    """Return the regular expression for a part of a pattern. A field in `seen` must have its earlier value."""
+    """Return the regular expression for a part of a pattern. A field in `seen` must match its first value."""
     if part == "*":
         return "[^/]*"
     field = _FIELD.fullmatch(part)

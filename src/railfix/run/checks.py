@@ -22,16 +22,16 @@ from railfix.track.track import ANOTHER_PLACE_M
 from railfix.track.trajectory import Trajectory
 
 _SECOND: Final = np.timedelta64(1, "s")
-#: Number of conventional positions per antenna after which a run stops if all of them are farther from the line than
-#: `ANOTHER_PLACE_M`.
+#: A run stops if each antenna has at least this number of conventional positions, all of them farther from the line
+#: than `ANOTHER_PLACE_M`.
 ENOUGH_TO_STOP: Final = 10
-#: Largest time between a log and its navigation records. More distant records are assumed to be of another day.
+#: Navigation records and sensor samples farther in time than this from a log are assumed to be of another day.
 ANOTHER_DAY: Final = np.timedelta64(24, "h")
-#: Sensors with samples only at events. They may have no samples for a long time, if the train is at rest or passes no
-#: balise or ground unit.
+#: Sensors with samples only at events. They have no samples while the train is at rest or passes no balise or ground
+#: unit.
 _OF_EVENTS: Final = ("tachometer", "ranging", "balises")
-#: Longest assumed time from the reference time of a navigation record to an epoch at which the record is usable
-#: (BeiDou: 6 h, `gnss.orbits.prepared_records.VALIDITY_S`).
+#: A navigation record is assumed to be usable at epochs at most this far from its reference time (BeiDou: 6 h,
+#: `gnss.orbits.prepared_records.VALIDITY_S`).
 RECORD_REACH: Final = np.timedelta64(6, "h")
 
 
@@ -55,7 +55,7 @@ def navigation_span(navigation: Navigation) -> Span | None:
 
 
 def check_each_file(navigation: Navigation, log: Log) -> None:
-    """Raise MismatchError if one of the several files of a log begins more than a day from all navigation records."""
+    """Raise MismatchError if a file of a log in several files begins more than a day from all navigation records."""
     times = navigation_times(navigation)
     for path, first in log.first_epochs() if len(times) else ():
         if np.abs(times - first).min() > ANOTHER_DAY:
@@ -71,12 +71,12 @@ def _spans(tally: Tally) -> dict[str, Span]:
 
 
 def spans_apart(one: Span, other: Span, *, reach: np.timedelta64 = _SECOND * 0) -> bool:
-    """Return whether two spans have no common time; the first is extended by `reach` at both ends. False for NaT."""
+    """Return whether two spans have no common time; `one` is extended by `reach` at both ends. False for NaT."""
     return bool(one[0] - reach > other[1] or one[1] + reach < other[0])
 
 
 def check_same_day(navigation: Navigation, tally: Tally, *, reach: np.timedelta64 = ANOTHER_DAY) -> None:
-    """Raise MismatchError if no pseudorange was used, because no navigation record is within `reach` of a log."""
+    """Raise MismatchError if, for lack of navigation records within `reach` of a log, no pseudorange was used."""
     if any(antenna.used for antenna in tally.antennas.values()):
         return
     span = navigation_span(navigation)
@@ -135,8 +135,8 @@ def check_sbas_time(corrections: MessageCorrections | None, tally: Tally) -> Non
 def check_sensor_time(sensors: SensorSamples, tally: Tally) -> tuple[str, ...]:
     """Return a note on each event sensor (`_OF_EVENTS`) whose table and the logs have no time in common.
 
-    Raise MismatchError if the table of another sensor and the logs have no time in common, or if the table of an event
-    sensor is more than a day from the logs.
+    Raise MismatchError if the table of a sensor that is not an event sensor and the logs have no time in common, or if
+    the table of an event sensor is more than a day from the logs.
     """
     spans, notes = list(_spans(tally).values()), []
     for name, samples in sensors.tables.items():
@@ -181,8 +181,8 @@ def check_whole_run(
 ) -> tuple[str, ...]:
     """Check the inputs and results of a whole run, and return the notes of `check_sensor_time`.
 
-    `causes` has the likely cause of missing positions by antenna; it is part of the error message. Raise MismatchError
-    if the inputs do not match each other. Raise NoPositionError if the run has no position.
+    `causes` has, for each antenna, the likely cause of missing positions, which the error message states. Raise
+    MismatchError if the inputs do not match each other. Raise NoPositionError if the run has no position.
     """
     check_same_time(tally)
     check_same_day(navigation, tally, reach=RECORD_REACH)

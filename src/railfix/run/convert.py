@@ -1,7 +1,7 @@
 """Conversion of receiver logs to RINEX, and of the positions of a run to ROS 2 messages and EGNSS MATE tables.
 
 The ROS 2 message definitions are from sensor_msgs and from https://github.com/EGNSS-MATE/emate_ros (MIT, commit 9067868
-of 16 April 2024, for ROS 1). A third message, railfix_msgs/Row, contains one row of the table of positions.
+of 16 April 2024, for ROS 1). A further message, railfix_msgs/Row, contains one row of the table of positions.
 """
 
 from __future__ import annotations
@@ -46,10 +46,10 @@ def convert_logs(
 ) -> list[str]:
     """Write the logs of one receiver as RINEX files. Return lines of text on the written files and the skipped items.
 
-    Observations are written to `out`, and ephemerides to `nav_out`; if None, the file is not written. `rinex` selects
-    version 3.04 or 4.02. Raise InputFileError if a log cannot be read, or if the logs have no data for a file. Raise
-    OutputError if `out` and `nav_out` are the same file, or if one of them exists already, is an input, or cannot be
-    written.
+    Observations are written to `out`, and ephemerides to `nav_out`; a file whose path is None is not written. `rinex`
+    selects version 3.04 or 4.02. Raise InputFileError if a log cannot be read, or if the logs lack the data for one of
+    the files. Raise OutputError if `out` and `nav_out` are the same file, or if one of them exists already, is an
+    input, or cannot be written.
     """
     if out is not None and nav_out is not None and out.resolve() == nav_out.resolve():
         raise OutputError(f"{out}: is given by --out and by --nav-out; give another file for one of them")
@@ -163,7 +163,7 @@ def write_mcap(rows: pl.DataFrame, path: Path, *, description: str) -> int:
 
 
 def _fix(row: dict[str, Any]) -> dict[str, Any]:
-    """Return the values of a sensor_msgs/NavSatFix message. All three axes have the variance along the line."""
+    """Return the values of a sensor_msgs/NavSatFix message. The variance along the line is used for all three axes."""
     return {
         "latitude": row["latitude_deg"],
         "longitude": row["longitude_deg"],
@@ -260,7 +260,7 @@ def _metres(values: np.ndarray) -> pl.Series:
 
 
 def _last_balise(rows: pl.DataFrame, passings: pl.DataFrame | None) -> pl.DataFrame:
-    """Return the last balise read before each row, and its chainage; null and NaN if none was read before."""
+    """Return the balise last read up to each row (null if none), and its chainage (NaN if none)."""
     empty = pl.DataFrame(schema={"read_gpst": pl.Datetime("ns"), "balise": pl.String, "chainage_m": pl.Float64})
     read = empty if passings is None else passings.filter(pl.col("verdict") == "read").select(empty.columns)
     times = rows.select(pl.col("time_gpst").cast(pl.Datetime("ns")))

@@ -51,7 +51,7 @@ class FileFinding:
     kind: Kind
     facts: tuple[str, ...]  #: Short descriptions of the content, shown to the user.
     span: Span | None = None  #: First and last time of the content, GPS time; None if unknown.
-    place_ecef_m: Floats | None = None  #: A position in or near the content, ECEF, shape (3,) [m]; None if unknown.
+    place_ecef_m: Floats | None = None  #: A position on the track or run, ECEF, shape (3,) [m]; None if unknown.
     #: First and last reference time of the ephemerides in the file, or None if the file has no ephemerides.
     ephemerides: Span | None = None
     options: tuple[str, ...] = ()  #: Command-line options that are needed to read the file.
@@ -137,7 +137,7 @@ def _find_kinds(path: Path) -> tuple[Kind, ...]:
 
 
 #: Columns of track maps and position logs, for messages.
-_PLACES: Final = "a track map has latitude_deg and longitude_deg, a log of positions also times, or x_m, y_m, z_m"
+_PLACES: Final = "track maps have latitude_deg, longitude_deg; position logs have times and these two or x_m, y_m, z_m"
 
 
 def _unknown(path: Path) -> FileFinding:
@@ -241,7 +241,7 @@ def _track(path: Path) -> FileFinding:
         options = ("--height-datum", datum, *(("--geoid", "egm96") if kml else ()))
         problems = (
             f"{path}: does not state its height datum; the command takes the heights as {datum}"
-            f"{', as KML defines them' if kml else ''}; --height-datum and --geoid change that",
+            f"{', as KML defines them' if kml else ''}; to change this, give --height-datum and --geoid",
         )
     facts = []
     if any(segment.height_datum == NO_HEIGHTS for segment in segments):
@@ -331,7 +331,7 @@ def _sbas(path: Path) -> FileFinding:
     return FileFinding(path=path, kind="sbas", facts=facts, span=(messages.time.min(), messages.time.max()))
 
 
-#: Kinds of input that a file may be, by file kind.
+#: For each file format, the kinds of input that it may contain.
 _KINDS: Final[dict[FileKind, tuple[Kind, ...]]] = {
     "observations": ("observations",),
     "navigation": ("navigation",),
@@ -342,13 +342,13 @@ _KINDS: Final[dict[FileKind, tuple[Kind, ...]]] = {
     **{kind: ("track",) for kind in MAPS if kind not in POSITIONS},
     **dict.fromkeys(("nmea", "novatel", "rtklib"), ("positions",)),
 }
-#: Readers by kind of input, for readers with two arguments: path and date of the log.
+#: Reader of each kind of input that is read with the path and the date of the log.
 _DATED: Final[dict[Kind, Callable[[Path, np.datetime64 | None], FileFinding]]] = {
     "observations": _observations,
     "navigation": _navigation,
     "positions": _positions,
 }
-#: Readers by kind of input, for readers with the path as the only argument.
+#: Reader of each kind of input that is read with the path only.
 _READERS: Final[dict[Kind, Callable[[Path], FileFinding]]] = {
     "track": _track,
     "orbits": _orbits,

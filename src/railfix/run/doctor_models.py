@@ -16,7 +16,7 @@ from railfix.ranges.error_model import read_error_model
 
 ModelKind = Literal["C/N0 curve", "error model", "integrity support message", "scenario"]
 MODEL_KINDS: Final[tuple[ModelKind, ...]] = get_args(ModelKind)
-#: Kind of model file by the entry `format`, version excluded.
+#: Kind of model file for each value of the entry `format` without its version.
 _FORMATS: Final[dict[str, ModelKind]] = {
     CURVE_FORMAT.rpartition(" ")[0]: "C/N0 curve",
     ERROR_FORMAT.rpartition(" ")[0]: "error model",
@@ -24,7 +24,7 @@ _FORMATS: Final[dict[str, ModelKind]] = {
 }
 #: Top-level entries that only scenarios and recipes for several scenarios have.
 _OF_SCENARIO: Final = {"duration_s", "rate_hz", "line", "run", "runs", "sky", "receiver", "environment", "stations"}
-#: Option of `railfix run` that accepts the model file, by kind.
+#: Option of `railfix run` that accepts each kind of model file.
 _OPTIONS: Final[dict[ModelKind, str]] = {
     "C/N0 curve": "--cn0-curve",
     "error model": "--error-model",

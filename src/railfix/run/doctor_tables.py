@@ -31,13 +31,13 @@ TABLE_KINDS: Final[tuple[TableKind, ...]] = get_args(TableKind)
 _OF_MATE: Final[Mapping[str, TableKind]] = {
     "S_IMU": "inertial", "S_SPEEDOMETER": "radar", "S_BALISEREADER": "balises", "S_DM_BALISE": "list of balises",
 }  # fmt: skip
-#: Option that accepts a table, by kind. The command is also named if it is not `railfix run`.
+#: Option that accepts each kind of table, with the command in front if it is not `railfix run`.
 _OPTIONS: Final[Mapping[TableKind, str]] = {
     **{kind: f"--{kind.replace('_', '-')}" for kind in TABLE_KINDS},
     "list of balises": "--balise-list or --virtual-balises", "pulses": "railfix reference --pulses",
     "acceleration": "railfix reference --acceleration", "sections": "railfix evaluate --sections",
 }  # fmt: skip
-#: Tables that are used only in pairs: kind of the partner table by kind of table.
+#: For each kind of table that is used only in a pair, the kind of its partner.
 PAIRS: Final[Mapping[TableKind, TableKind]] = {
     "ranging": "ranging_units", "ranging_units": "ranging", "balises": "list of balises", "list of balises": "balises",
 }  # fmt: skip
@@ -64,7 +64,7 @@ def find_table_kind(path: Path) -> TableKind | Literal["other"] | None:
         return "sections"
     if names & {"chainage_m", "kilometrage_m"} and names & {"height_m", "elevation_m"}:
         return "heights"
-    # tables with these columns are results or ground truth
+    # a table with one of these columns has results or ground truth
     found = None if names & {"antenna", "read"} else find_sensor_table(columns)
     return next((table for table in TABLE_KINDS if table == found), "other")
 

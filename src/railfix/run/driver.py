@@ -197,7 +197,7 @@ def open_inputs(
 
 
 def find_record_time(navigation: Navigation) -> np.datetime64 | None:
-    """Return the median time of the navigation data, the epoch of frame transformations, or None without data."""
+    """Return the epoch for frame transformations: the median time of the navigation data, or None without data."""
     clocks = np.concatenate([navigation.kepler.toc, navigation.glonass.toe])
     if navigation.precise is not None:
         clocks = navigation.precise.time
@@ -260,7 +260,7 @@ def _screen_chunks(
     others: tuple[SensorSamples, BaseLog | None],
     processor: EpochProcessor,
 ) -> Iterator[Chunk]:
-    """Yield the screened chunks, each with the sensor samples and base-station epochs up to its end."""
+    """Yield the screened chunks, each with the sensor samples and base-station epochs up to the chunk's end."""
     samples, station = others
     after, state = np.datetime64("NaT", "ns"), State()
     for chunk in chunks:
@@ -282,7 +282,7 @@ def _single_epochs(screened: Iterator[Chunk], processor: EpochProcessor) -> Iter
 def _causes(
     tally: Tally, logs: Mapping[Antenna, Log], processor: EpochProcessor, config: Config, line: OpenedLine
 ) -> dict[str, str]:
-    """Return the likely cause ("" if unknown) by antenna, if at least 90 % of positions are off map or inconsistent."""
+    """Return the likely cause (or "") for each antenna with at least 90 % of positions off map or inconsistent."""
     causes: dict[str, str] = {}
     for name in logs:
         antenna = tally.antennas[name]
@@ -308,7 +308,7 @@ def _notes_of_sensors(
 
 #: Last clause of a note on positions off the map, if their cause is unknown.
 _TRACK: Final = "check whether this is the right track"
-#: Maximum number of notes on excluded satellites, per antenna and stage.
+#: Maximum number of notes on excluded satellites for each antenna and each stage (single epochs, filter).
 _NAMED: Final = 3
 
 
@@ -323,7 +323,7 @@ def collect_notes(
 ) -> tuple[str, ...]:
     """Return the notes of a run without repetitions.
 
-    `causes` has the likely cause of positions off the map, by antenna. A map offset is noted if its test statistic
+    `causes` has the likely cause of positions off the map for each antenna. A map offset is noted if its test statistic
     exceeds `note_statistic`.
     """
     notes = [
@@ -369,7 +369,7 @@ def collect_notes(
     return tuple(dict.fromkeys(notes))
 
 
-#: Other time scales by their difference from GPS time [s], by which time tags in a wrong scale are recognised.
+#: Time scale that was probably used instead of GPS time, by the time-tag error to which it leads [s].
 _SCALES: Final = {-18.0: "UTC", -14.0: "BeiDou time", 19.0: "TAI"}
 
 
@@ -393,7 +393,7 @@ def _describe_sign(sign: str, tag_error_s: tuple[float, float]) -> str:
     return f"the time tags are {size} {which}, so there is no protection level ({guess})"
 
 
-#: Largest spread of a time-tag error that is taken as constant [s].
+#: Time-tag errors that differ by at most this are taken as equal [s].
 _STEADY_S: Final = 0.5
 
 
@@ -428,7 +428,7 @@ def _notes_of_levels(config: Config, tally: Tally) -> Iterator[str]:
         return
     used = sum(antenna.used for antenna in tally.antennas.values())
     excluded = sum(antenna.first_reason["fault_excluded"] for antenna in tally.antennas.values())
-    # Exclusions beyond the expected false alarms are taken as faults. Their rate is compared with the prior.
+    # Exclusions in excess of the expected false alarms are taken as faults. The fault rate is compared with the prior.
     observed = sum(antenna.observed for antenna in tally.antennas.values())
     faults = excluded - config.raim.false_alarm * observed
     prior = risk.local_prior + max(risk.satellite_prior.values())

@@ -62,7 +62,7 @@ VIRTUAL_BALISES: Final = (
 class InputFiles(Settings):
     """Input files of a command; each field is a path, several paths, or None."""
 
-    #: Fields with logs. Ephemerides in receiver logs are used if no navigation file is given.
+    #: Names of the fields with logs. Ephemerides in receiver logs are used if no navigation file is given.
     own_navigation: ClassVar[tuple[str, ...]] = ()
 
     @model_validator(mode="before")
@@ -96,7 +96,7 @@ class InputFiles(Settings):
             _check_file(f"--set {name}" if name == "integrity_support" else f"--{name.replace('_', '-')}", path)
 
     def entries(self, pool: Executor, folder: Path) -> Entries:
-        """Compute the `fingerprint` of each file in the executor `pool`, with paths relative to `folder`."""
+        """Let the executor `pool` compute the `fingerprint` of each file, with paths relative to `folder`."""
         return [
             pool.submit(fingerprint, kind, path, name=record_path(path, folder)) for kind, path in self.files_by_name()
         ]
@@ -180,11 +180,11 @@ class RunInputs(InputFiles):
     def _complete(self) -> Self:
         missing = [name for name in ("front", "track") if not getattr(self, name)]
         if missing:
-            raise ValueError(f"{missing[0]} (--{missing[0]}) is missing; give its file, or a folder with mate (--mate)")
+            raise ValueError(f"{missing[0]} (--{missing[0]}) is missing; give its file, or use --mate FOLDER")
         return self
 
     def prepare(self, config: Config) -> tuple[Self, Config]:
-        """Check the inputs. Return them, including files that settings name, and settings without ``sbas="stream"``."""
+        """Check the inputs. Return them with the files that settings name; also return settings without "stream"."""
         self.check()
         config = self._with_own_sbas(config)
         inputs = self.with_settings(config)
@@ -389,7 +389,7 @@ class ColumnNames(Settings):
 
     @property
     def names(self) -> dict[str, str]:
-        """Column name in the file by quantity. Raise SettingsError if a text is not NAME=COLUMN."""
+        """For each quantity, its column in the file. Raise SettingsError if a text is not NAME=COLUMN."""
         return column_names(self.column)
 
 

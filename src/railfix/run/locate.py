@@ -91,7 +91,7 @@ def locate_files(
 
 
 def reasons_text(located: Located) -> str:
-    """Return a text with the number of epochs without a position for each reason, or "" if all have a position."""
+    """Return, as text, the number of epochs without a position by reason, or "" if every epoch has a position."""
     found = Counter(located.no_position.tolist())
     return ", ".join(f"{count} {NoPosition(reason).text}" for reason, count in sorted(found.items()) if reason)
 
@@ -126,9 +126,9 @@ def solution_text(located: Located) -> str:
 _CHUNK_EPOCHS: Final = 3000
 #: Number of epochs that `likely_cause` tests.
 _EPOCHS: Final = 5
-#: Largest horizontal distance from the line of a position that is taken to be on the line [m].
+#: A position is taken to be on the line if its horizontal distance from the line is less than this [m].
 _ON_LINE_M: Final = 150.0
-#: A larger height difference between positions and line is assumed not to be due to range errors [m].
+#: A height difference between positions and line is not attributed to range errors if it exceeds this [m].
 _HEIGHT_M: Final = 30.0
 #: GPS time minus UTC since 2017 [s].
 _LEAP_S: Final = 18
@@ -137,9 +137,9 @@ _BEIDOU_S: Final = 14
 #: Largest time-zone shift that is tested [h].
 _HOURS: Final = 14
 _FEET: Final = 0.3048
-#: Largest difference between a height offset and the offset expected from its likely cause [m].
+#: A cause is not reported if the offset that it would produce differs by this or more from the height offset [m].
 _CAUSE_M: Final = 15.0
-#: A wrong height datum is considered if the geoid is farther than this from the ellipsoid [m].
+#: A wrong height datum is considered as a cause only if the geoid is farther than this from the ellipsoid [m].
 _GEOID_M: Final = 10.0
 
 
@@ -179,7 +179,7 @@ def _shifts_s() -> Iterator[int]:
 def _offset_m(
     observations: Observations, received: Received, config: Config, line: Trajectory
 ) -> tuple[float, float, float, float] | None:
-    """Return the median position's horizontal and vertical offset from the line, and the line and geoid heights [m].
+    """Return horizontal and vertical offset of the median position from the line, line height and geoid height [m].
 
     Return None if no epoch has a position.
     """
@@ -309,9 +309,9 @@ def _check_together(runs: Sequence[SurveyRun]) -> None:
 
 #: Columns of ``train.parquet`` with measured line properties: chainage [m], gradient [permille], curvature [1/m].
 _COLUMNS: Final = ("measured_chainage_m", "measured_gradient_permille", "measured_curvature_1pm")
-#: Minimum change of gradient or curvature that is a feature [standard deviations].
+#: A change of gradient or curvature is a feature if it is at least this many standard deviations.
 _SIGMAS: Final = 5.0
-#: Minimum number of values for a mean.
+#: Features are sought only where a mean is computed from at least this number of values.
 _LEAST_VALUES: Final = 3
 #: Number of iterations in which `centre_features` centres its window on a change.
 _CENTRED: Final = 5
@@ -347,7 +347,7 @@ class MeasuredFeature:
     """Feature detected in the combined values of all runs."""
 
     feature: Feature  #: Feature; its `arc_m` is a chainage.
-    places_m: Floats  #: Chainage of the feature in each run that alone detects it, shape (R,) [m].
+    places_m: Floats  #: Chainage of the feature in each of the R runs that show it by themselves, shape (R,) [m].
     map_m: float  #: Chainage of the feature in the map [m], NaN if the map lacks it.
 
 
@@ -373,7 +373,7 @@ def _nearest(feature: Feature, others: Sequence[Feature]) -> float:
 
 
 def _features(rows: pl.DataFrame) -> list[Feature]:
-    """Return the features in rows ordered by chainage. Each section with enough values is searched separately."""
+    """Return the features in `rows` (ordered by chainage). Each section with enough values is searched separately."""
     at = rows[_COLUMNS[0]].to_numpy()
     grid = np.arange(np.ceil(at[0]), np.floor(at[-1]), STEP_M)
     first = np.searchsorted(at, grid - 0.5 * BASE_M)

@@ -8,7 +8,7 @@ from typing import Any, Final
 from railfix.core.errors import InputFileError
 from railfix.io.mate import mate_table
 
-#: Field of `RunInputs` by EGNSS MATE table. If both track tables exist, the table listed first is used.
+#: Field of `RunInputs` for each EGNSS MATE table. If both track tables exist, the table listed first is used.
 _INPUTS: Final = {
     "S_GNSS_SAT": "front", "S_DM_TRACKPOINT": "track", "S_DM_TRACK_SEGMENT_POSITION": "track", "S_IMU": "inertial",
     "S_SPEEDOMETER": "radar", "S_BALISEREADER": "balises", "S_DM_BALISE": "balise_list",
@@ -16,7 +16,7 @@ _INPUTS: Final = {
 
 
 def find_inputs(folder: Path) -> dict[str, Any]:
-    """Return the paths of the tables in a folder by field of `railfix.run.inputs.RunInputs`.
+    """Return, for fields of `railfix.run.inputs.RunInputs`, the paths of the tables in a folder.
 
     Raise InputFileError if the folder does not exist, or if it lacks the table S_GNSS_SAT or a track table.
     """
@@ -30,6 +30,6 @@ def find_inputs(folder: Path) -> dict[str, Any]:
     for name, needed in (("front", "S_GNSS_SAT"), ("track", "S_DM_TRACK_SEGMENT_POSITION or S_DM_TRACKPOINT")):
         if name not in given:
             raise InputFileError(folder, f"has no table {needed} (.parquet or .csv) of EGNSS MATE; add it")
-    if not {"balises", "balise_list"} <= given.keys():  # readings and list are only usable together
+    if not {"balises", "balise_list"} <= given.keys():  # balise readings are usable only with a list
         given = {name: path for name, path in given.items() if not name.startswith("balise")}
     return given

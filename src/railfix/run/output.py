@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 _PREFIX: Final = ".railfix-"
 _LOCK: Final = ".lock"
-#: Folder with the complete files inside a staging folder. A single rename creates it with all files.
+#: Subfolder of a staging folder with the complete files. A single rename creates it with all files.
 READY: Final = "ready"
 
 
@@ -204,7 +204,7 @@ class ParquetFile:
 Overwrite = Literal["refuse", "replace"]
 #: Kind of a single output file, for `check_output_file`.
 FileKind = Literal["page", "csv", "pos", "picture", "png", "map", "any"]
-#: Description, name endings, and hint on other formats, by kind of file.
+#: For each kind of file: description, name endings, and hint on other formats.
 _ENDINGS: Final[Mapping[str, tuple[str, tuple[str, ...], str]]] = {
     "page": ("an HTML page", (".html", ".htm"), "; for a PDF file, print the page in a browser"),
     "csv": ("a table in CSV", (".csv",), ""),
@@ -402,8 +402,8 @@ def check_not_input(target: Path, inputs: Sequence[Path]) -> None:
 def check_output_file(target: Path, *, overwrite: Overwrite, inputs: Sequence[Path], kind: FileKind = "any") -> None:
     """Raise OutputError if an output file cannot or must not be written.
 
-    This is the case if the folder of the file does not exist or is not writable, if the path is a folder or one of
-    `inputs`, if the file exists (with "refuse"), or if the name ending does not match `kind`.
+    Possible reasons: the folder of the file does not exist or is not writable; the path is a folder or one of `inputs`;
+    the file exists (with "refuse"); the name ending does not match `kind`.
     """
     with _writing(target):
         check_not_input(target, inputs)

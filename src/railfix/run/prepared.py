@@ -36,7 +36,7 @@ from railfix.track.trajectory import Trajectory
 VARIABLE: Final = "RAILFIX_CACHE_DIR"
 #: Minimum number of points of a cached line. 5000 points with two antennas take 0.11 s to prepare and 0.01 s to load.
 LEAST_POINTS: Final = 2_000
-#: Maximum number of cache entries; the oldest entries beyond it are deleted.
+#: Maximum number of cache entries; if there are more, the oldest entries are deleted.
 MOST_ENTRIES: Final = 48
 #: Trajectory attributes that are computed from the points, and cached with them.
 _DERIVED: Final = ("up", "across")
@@ -131,7 +131,7 @@ class PreparedLines:
 
 
 def compute_key(kind: str, *parts: object) -> str:
-    """Return the cache key of an object made from `parts`: paths of files, arrays, and other values.
+    """Return the cache key of an object that is computed from `parts`: paths of files, arrays, and other values.
 
     The key depends on the content of files and arrays, on the text of other values, and on the version of railfix.
     """
@@ -160,7 +160,7 @@ def track_key(track: Track) -> str:
 
 
 def _parts(value: Track | Trajectory) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """Return the fields of an object that are not arrays, and the fields that are. The provenance is in neither."""
+    """Return an object's fields that are not arrays, and its arrays. The provenance is omitted."""
     values = {item.name: getattr(value, item.name) for item in fields(value) if item.name != "provenance"}
     arrays = {name: array for name, array in values.items() if isinstance(array, np.ndarray)}
     return {name: v for name, v in values.items() if name not in arrays}, arrays

@@ -31,10 +31,10 @@ from railfix.track.trajectory import Trajectory
 
 
 def with_measured_priors(config: Config) -> Config:
-    """Return settings, completed by their error model: fault priors, and line sections without a protection level.
+    """Return settings, with fault priors and sections without a protection level taken from their error model.
 
     The settings remain unchanged if they have no error model, if they specify a fault prior, or if the error model has
-    no bounds of fault priors. Sections without a protection level that the settings specify are kept.
+    no bounds of fault priors. If the settings specify sections without a protection level, they are kept.
     """
     given = config.risk.model_fields_set & {"local_prior", "side_prior", "priors"}
     if config.error_model is None or given:
@@ -105,7 +105,7 @@ def make_processor(
     )
 
 
-#: A base-station time tag that is later than the train's by at most this is assumed to be of the same instant.
+#: A base-station epoch that is later than the train's epoch by at most this is assumed to be of the same instant.
 _SAME_INSTANT = np.timedelta64(50, "ms")
 
 
@@ -124,7 +124,7 @@ def parse_position(text: str, option: str) -> Floats:
 
 
 class BaseLog:
-    """Log of a base station. Its position is `place` (LAT,LON,HEIGHT), or if None, the position in the log header.
+    """Log of a base station. Without a `place` (LAT,LON,HEIGHT), its position is taken from its header.
 
     Raise InputFileError if the log has no epoch, or if neither `place` nor the header states the position.
     """

@@ -44,7 +44,7 @@ def compute_figures(folder: OutputFolder, tally: Tally, config: Config) -> dict[
     """Return statistics of each antenna, computed from the written tables. Lengths are in metres.
 
     There are statistics of the sigma along the line, the chainage, the finite protection levels (with epochs by
-    status), and the filter (with epochs by status, and levels within each limit of `WITHIN_M`). Missing ones are None.
+    status), and the filter (with epochs by status, and levels within each limit of `WITHIN_M`). Absent ones are None.
     """
     return {
         name: {
@@ -174,7 +174,7 @@ def package_versions() -> dict[str, str]:
     return versions
 
 
-#: Settings that never affected a result, by group and name; records of earlier versions have them.
+#: Group and name of each setting that never affected a result; records of earlier versions have these settings.
 WITHOUT_EFFECT: Final = (("section", "predicted_sigmas"),)
 
 
@@ -282,9 +282,9 @@ def read_parquet(path: Path, *, columns: cs.Selector | None = None) -> pl.DataFr
 
 
 Facts = Mapping[str, Any]
-#: Record keys of the standard deviation statistics, by their labels in the tables.
+#: For each label in the tables, the record key of the statistic of the standard deviation.
 _OF_SIGMA: Final = {"p50": "p50_m", "p95": "p95_m", "largest": "max_m"}
-#: Record keys of the protection level statistics, by their labels in the tables.
+#: For each label in the tables, the record key of the statistic of the protection level.
 _OF_LEVEL: Final = {"p50": "p50_m", "p95": "p95_m"}
 
 
@@ -297,8 +297,8 @@ def level_basis(record: Facts) -> str:
 def budget_tables(antennas: Mapping[str, Facts], basis: str) -> list[Table]:
     """Return three tables: filter epochs by status, single epochs by status, and pseudoranges by rejection reason.
 
-    `antennas` has the part of each antenna in ``run.json``, and `basis` is the result of `level_basis`. The first table
-    is absent if the filter was off. Fields that a record of an earlier version lacks are shown as a dash.
+    `antennas` has, for each antenna, its part of ``run.json``, and `basis` is the result of `level_basis`. The first
+    table is absent if the filter was off. Fields that a record of an earlier version lacks are shown as a dash.
     """
     filtered = {name: facts["filter"] for name, facts in antennas.items() if facts.get("filter")}
     caption = "Single epochs (positions.csv)" if filtered else "Epochs by status"
@@ -355,7 +355,7 @@ def _epochs_table(antennas: Mapping[str, Facts], basis: str, caption: str) -> Ta
 
 
 def _rows_of_few(antennas: Sequence[Facts]) -> Iterator[list[str]]:
-    """Yield a row per rejection reason: epochs with too few satellites because of the reason, and of it alone."""
+    """Yield a row per rejection reason: the epochs with too few satellites because of it, and because of it alone."""
     first = [Counter(facts.get("too_few_satellites_by_first_reason") or {}) for facts in antennas]
     alone = [Counter(facts.get("too_few_satellites_by_one_reason_alone") or {}) for facts in antennas]
     for reason in dict.fromkeys(name for counts in first for name, _ in counts.most_common()):

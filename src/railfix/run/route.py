@@ -35,7 +35,7 @@ from railfix.track.network_route import find_route, left_out_note
 
 #: Interval of the matched positions [s].
 _INTERVAL_S: Final = 1.0
-#: A track of the route is near a position if it is within this distance along the route [m].
+#: A track of the route is near a position that is at most this far beyond its ends along the route [m].
 _REACH_M: Final = 50.0
 #: Assumed bound on the relative difference between lengths in plan and lengths along the line. `_REACH_M` is increased
 #: by this fraction of the route length.
@@ -48,7 +48,7 @@ _LEAST_NAMED: Final = 0.01
 _NAMED: Final = 8
 #: Largest gap between consecutive positions of one `Alternative` [s].
 _TOGETHER_S: Final = 60.0
-#: Probability above which the log is taken to indicate an unmapped track: twice the prior.
+#: The log is taken to indicate an unmapped track if the track's probability exceeds this: twice the prior.
 _UNMAPPED_LIMIT: Final = 2.0 * UNMAPPED_PRIOR
 #: Name that results use for an unmapped track.
 NONE: Final = "none"
@@ -73,7 +73,7 @@ TRACK_COLUMNS: Final[dict[str, str]] = {
     "on_route": "whether the track belongs to the route on which the positions are computed",
     "probability": "probability of `track` given the whole log; the rows of an epoch and antenna sum to 1",
     "chainage_m": "distance in plan along the track from its first point to the point nearest to the position",
-    "kilometrage_m": "kilometrage at the point of `chainage_m` as marked on the line, if the map has it",
+    "kilometrage_m": "kilometrage as marked on the line, at the point of `chainage_m`; null if the map has none",
     "offset_m": "distance in plan from the position, which lies on the route, to the track",
     "unconstrained_offset_m": "offset in plan, from the track, of the 3-D position computed without the map; positive "
     "to the right",

@@ -25,27 +25,27 @@ from railfix.tracking import Line
 
 #: Length of the time cells over which positions are averaged [s].
 _CELL_S: Final = 4.0
-#: Minimum speed at which signs are checked [m/s].
+#: Signs of speeds are checked only where the expected speed exceeds this [m/s].
 _MOVING_MPS: Final = 1.0
-#: Minimum number of cells for a check.
+#: Checks with fewer time cells than this are omitted.
 _LEAST_CELLS: Final = 15
-#: Minimum rms variation of the expected force for a comparison [m/s2].
+#: Forces are compared only if the expected force varies by at least this (rms) [m/s2].
 _LEAST_FORCE_MPS2: Final = 0.08
-#: Minimum rms variation of the expected speed for a comparison [m/s].
+#: Speeds are compared only if the expected speed varies by at least this (rms) [m/s].
 _LEAST_SPEED_MPS: Final = 1.0
-#: Minimum rms of the expected turn rate for a comparison [rad/s].
+#: Turn rates are compared only if the rms of the expected turn rate is at least this [rad/s].
 _LEAST_RATE_RADPS: Final = 0.003
-#: Slope of measured over expected values below which a sensor's sign is taken to be reversed.
+#: A sensor's sign is taken to be reversed if the slope of measured over expected values is below this.
 _REVERSED: Final = -0.3
-#: Slope of measured over expected turn rates above which the rates are taken to be in degrees per second.
+#: Turn rates are taken to be in deg/s if the slope of measured over expected turn rates exceeds this in magnitude.
 _IN_DEGREES: Final = 10.0
 #: Largest tested lag of the time tags [s].
 _LONGEST_LAG_S: Final = 20.0
 #: Smallest reported lag of the time tags [s].
 _LEAST_LAG_S: Final = 2.0
-#: Minimum factor by which a lag must reduce the unexplained variance.
+#: A lag is reported only if it reduces the unexplained variance by more than this factor.
 _LESS_ALIKE: Final = 2.0
-#: Largest accepted difference of the mean force from gravity, as a fraction of gravity.
+#: Largest accepted difference between the size of the median force and gravity, as a fraction of gravity.
 _GRAVITY_SHARE: Final = 0.12
 
 
@@ -170,7 +170,7 @@ def _radar_speeds(radar: RadarSpeeds, time: Datetimes) -> Floats:
 
 
 def _means(time: Datetimes, values: Floats, middle: Datetimes) -> Floats:
-    """Return the mean of the samples from one cell length before to one after each instant; NaN where not covered."""
+    """Return the mean of the samples within one cell length of each instant; NaN where samples do not cover it."""
     half = timedelta(np.array([_CELL_S]))
     begin, end = middle - half, middle + half
     first, last = np.searchsorted(time, begin), np.searchsorted(time, end)
@@ -186,7 +186,7 @@ def _centre(values: Floats) -> Floats:
 
 
 def _forces_at_rest(inertial: InertialSamples) -> Iterator[str]:
-    """Yield a sentence if the median specific force is not that of gravity, -9.8 m/s2 on the axis that points down."""
+    """Yield a sentence if the median specific force is not -9.8 m/s2 (gravity) on the axis that points down."""
     if not np.isfinite(inertial.force_mps2).any(axis=0).all():
         return
     forward, right, down = np.nanmedian(inertial.force_mps2, axis=0).tolist()
@@ -194,7 +194,7 @@ def _forces_at_rest(inertial: InertialSamples) -> Iterator[str]:
     if abs(size - 1.0) < _GRAVITY_SHARE:
         yield "inertial: its forces are in g, not in m/s2; multiply them by 9.80665"
     elif abs(size / GRAVITY_MPS2 - 1.0) > _GRAVITY_SHARE:
-        yield f"inertial: its mean force is {size:.2f} m/s2, not {GRAVITY_MPS2:.2f}; specific forces are expected"
+        yield f"inertial: its median force is {size:.2f} m/s2, not {GRAVITY_MPS2:.2f}; specific forces are expected"
     elif abs(down) < 0.8 * size:
         axis = "force_forward_mps2" if abs(forward) > abs(right) else "force_right_mps2"
         yield f"inertial: gravity is in {axis}, not in force_down_mps2; swap the columns of the axes"
@@ -211,9 +211,9 @@ def _slope(expected: Floats, measured: Floats, least: float) -> float:
     return float((x * y).sum() / (x * x).sum())
 
 
-#: Interval at which wheel speeds are compared [ns].
+#: Interval at which wheel speeds are compared with Doppler speeds [ns].
 _STEP_NS: Final = 500_000_000
-#: Largest time from a sensor speed to the Doppler speeds before and after it [s].
+#: A sensor speed is compared only if the Doppler speeds before and after it are at most this far away [s].
 _NEAR_S: Final = 1.5
 #: Smallest reported relative scale error.
 _SCALE: Final = 0.01
@@ -221,15 +221,15 @@ _SCALE: Final = 0.01
 _LAG_S: Final = 0.3
 #: Relative scale error that wheel wear cannot cause; above it, the note suggests another number of pulses per turn.
 _OTHER_TEETH: Final = 0.1
-#: Largest time between the two satellite positions (before and after) with which a range is compared [s].
+#: A range is compared with the satellite positions before and after it if they are at most this far apart [s].
 _BETWEEN_S: Final = 3.0
-#: Minimum distance between these two satellite positions [m].
+#: Ranges are not compared if the train moves by at most this between the two satellite positions [m].
 _MOVED_M: Final = 1.0
 #: Largest distance of a ground unit whose ranges are compared with satellite positions [m].
 _FAR_M: Final = 500.0
-#: Minimum cosine of the angle between the track and the direction to the ground unit.
+#: Ground units are taken as ahead or behind if the cosine of their angle to the track exceeds this in magnitude.
 _AHEAD: Final = 0.7
-#: Ranges to ground units ahead, or behind, are compared if there are at least this number.
+#: Ranges to units ahead (or behind) are compared only if there are at least this number of them.
 _LEAST_RANGES: Final = 10
 #: Smallest reported difference between measured ranges and ranges computed from satellite positions [m]. It is twice
 #: the assumed code error that lasts for minutes.
@@ -281,7 +281,7 @@ class SensorChecks:
 def range_notes(
     ranging: StationRanges, units: GroundUnits, places: pl.DataFrame, trajectory: Trajectory, limits: SensorLimits
 ) -> Iterator[str]:
-    """Yield sentences on an along-track offset or a bias of ranges compared with satellite positions.
+    """Yield sentences on an along-track offset or a bias of ranges, found by comparison with satellite positions.
 
     `places` has ``time_gpst`` and ``chainage_m`` of an antenna. `limits` has the ranging unit's position on the
     vehicle.

@@ -122,9 +122,9 @@ def open_line(
     """Read the track and the vehicle, and compute the trajectory of each antenna.
 
     With a time `at`, the track is transformed to the satellites' reference frame at that time (`railfix.track.frames`).
-    Without it, coordinates remain in the map's frame. A single file whose tracks do not join to one route is a network;
-    its route is found from `log`. If `heights` is `OF_LOG`, a map without heights gets the heights of the positions of
-    `log`. Raise a RailfixError (`railfix.core.errors`) if a file or the route is unusable.
+    Without `at`, coordinates remain in the map's frame. A single file whose tracks do not join to one route is a
+    network; its route is found from `log`. If `heights` is `OF_LOG`, a map without heights gets the heights of the
+    positions of `log`. Raise a RailfixError (`railfix.core.errors`) if a file or the route is unusable.
     """
     prepared = PreparedLines(use=reading.cache == "use")
     key = compute_key("line", *track, heights, *vars(reading.of_map).values(), reading.height_sigma)

@@ -29,9 +29,9 @@ _SHARE: Final = 0.9
 _BESIDE_BASE_M: Final = 0.05
 #: An antenna is at rest if the median positions in the three thirds of its log differ by at most this in plan [m].
 _AT_REST_M: Final = 8.0
-#: A larger change of a double difference between epochs is taken as a cycle slip [wavelengths].
+#: A change of a double difference between epochs by more than this is taken as a cycle slip [wavelengths].
 _SLIP: Final = 0.25
-#: Minimum length of a double difference's longest part without a slip, as a fraction of the epochs.
+#: A double difference is used if its longest part without a slip has at least this fraction of the epochs.
 _UNBROKEN: Final = 0.5
 #: RINEX loss-of-lock bits: bit 0 for a cycle slip since the previous epoch, bit 1 for a half-cycle ambiguity.
 _LOST, _HALF_CYCLE = 1, 2

@@ -51,7 +51,7 @@ _NO_RECORD = Reason.NO_EPHEMERIS | Reason.EPHEMERIS_TOO_OLD
 
 @dataclass(frozen=True, kw_only=True)
 class MapOffsetFound:
-    """Mean offset from the line of the 3-D positions in a time window."""
+    """Mean offset of the 3-D positions of a time window from the line."""
 
     time: np.datetime64  #: End of the window.
     across_m: float  #: Offset to the right of the line [m].
@@ -78,7 +78,7 @@ class AntennaTally:
     """Counts of one antenna's epochs and observations."""
 
     min_satellites: int = 3  #: Minimum number of satellites of a position.
-    judged: dict[str, bool] = field(default_factory=dict)  #: Whether each screen has tested any observation.
+    judged: dict[str, bool] = field(default_factory=dict)  #: For each screen, whether it has tested any data.
     epochs: int = 0  #: Number of epochs.
     observed: int = 0  #: Number of epochs with at least one pseudorange.
     positioned: int = 0  #: Number of epochs with coordinates.
@@ -86,12 +86,12 @@ class AntennaTally:
     used: int = 0  #: Number of pseudoranges used for positions.
 
     status: Counter[str] = field(default_factory=Counter)  #: Number of epochs by status.
-    status_positioned: Counter[str] = field(default_factory=Counter)  #: Number of epochs with coordinates by status.
+    status_positioned: Counter[str] = field(default_factory=Counter)  #: Number of epochs with coordinates, by status.
     #: Number of epochs with too few satellites, by decisive reason. Rejection reasons are applied in the order of their
-    #: bits; the decisive reason is the first after which too few satellites remain. It is `not_observed` if too few
-    #: satellites were observed, and `used` if enough remained, but their clocks left no range for the position.
+    #: bits; the first after which too few satellites remain is decisive. The decisive reason is `not_observed` if too
+    #: few satellites were observed, and `used` if enough remained, but their clocks left no range.
     short_first: Counter[str] = field(default_factory=Counter)
-    #: Number of epochs with too few satellites, by rejection reason without which enough would remain.
+    #: For each rejection reason, number of epochs with too few satellites that would have enough without this reason.
     short_only: Counter[str] = field(default_factory=Counter)
     #: Number of rejected observations by their first rejection reason.
     first_reason: Counter[str] = field(default_factory=Counter)
@@ -176,7 +176,7 @@ class AntennaTally:
             self.tag_error_s = float(np.fmin(low, error.min())), float(np.fmax(high, error.max()))
 
     def _add_map_offset(self, result: AntennaResult) -> None:
-        """Keep the map offset with the largest test statistic, windows with an interference cause excluded."""
+        """Keep the map offset with the largest statistic; ignore windows whose result is not in `_MAP_IN_QUESTION`."""
         offset, interference = result.map_offset, result.interference
         if not np.isfinite(offset.statistic).any():
             return
@@ -308,12 +308,12 @@ class Tally:
 
     @property
     def epochs(self) -> int:
-        """Number of epochs of all antennas."""
+        """Number of epochs, summed over all antennas."""
         return sum(a.epochs for a in self.antennas.values())
 
     @property
     def positioned(self) -> int:
-        """Number of epochs with coordinates of all antennas."""
+        """Number of epochs with coordinates, summed over all antennas."""
         return sum(a.positioned for a in self.antennas.values())
 
 
@@ -354,7 +354,7 @@ class ResultRows:
     folder: OutputFolder
     line: OpenedLine
     observations: bool  #: Whether the table of observations is written.
-    checks: SensorChecks | None  #: Sensor checks with the first antenna; None without sensors.
+    checks: SensorChecks | None  #: Checks of the sensors against the first antenna; None without sensors.
     replays: Mapping[str, Replays]  #: Filter input by antenna, stored for smoothing; empty without smoothing.
     passings: bool = False  #: Whether the table of passings of balises and virtual balises is written.
     #: Notes on balises that were missed or were read at a wrong position.

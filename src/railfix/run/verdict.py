@@ -125,7 +125,7 @@ def judge_run(record: Mapping[str, Any]) -> Verdict:
 
 
 def _figures(facts: Mapping[str, Any], promised: Sequence[str]) -> PositionFigures:
-    """Return the figures of an antenna or its filter. `promised` are the statuses of passed positions."""
+    """Return the figures of an antenna or its filter. `promised` are the statuses that mean "passed every check"."""
     statuses = Counter({word: epochs for word, epochs in facts["status"].items() if epochs})
     chainage, sigma, level = (facts.get(name) or {} for name in ("chainage_m", "along_sigma_m", "level"))
     return PositionFigures(
@@ -162,7 +162,7 @@ def _describe_checks(figures: Sequence[PositionFigures]) -> str:
     failed = _count_statuses(figures)
     del failed[Status.OK.text]
     text = f"single epochs: {passed:,} of {epochs:,} with observations passed every check"
-    return f"{text}; most of the others are {failed.most_common(1)[0][0]}" if failed else text
+    return f"{text}; the most frequent other status is {failed.most_common(1)[0][0]}" if failed else text
 
 
 def _describe_filter(figures: Sequence[PositionFigures]) -> str:

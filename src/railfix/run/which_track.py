@@ -1,7 +1,7 @@
 """Probability of each track of a network from logs of a train at rest.
 
 A train that was switched off on a known track and has not moved since is still on that track. A cold-movement detector
-or the odometer measures the distance moved. It may miss a movement with a specified probability.
+or the odometer measures the distance moved. A movement remains unnoticed with a specified probability.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from railfix.track.frames import in_map_frame
 from railfix.track.network import Network
 from railfix.track.network_read import read_network
 
-#: Largest measured distance of a train that is assumed not to have moved (wheel creep, coupler slack) [m].
+#: A train is assumed not to have moved if its measured distance is at most this (wheel creep, coupler slack) [m].
 _SAME_PLACE_M: Final = 1.0
 #: Proportional part of the assumed odometer error bound, as a fraction of the distance moved.
 _ODOMETER_SHARE: Final = 0.05
@@ -68,7 +68,7 @@ def prior_of_last_place(
     """Return the track prior, given the file written by `write_last_place` and the distance moved since then [m].
 
     `missed_move` is the probability that the train was moved unnoticed, to any track. `unmapped` is the prior of an
-    unmapped track in that case. Raise InputFileError if the file has no track probabilities for this network.
+    unmapped track after such a move. Raise InputFileError if the file has no track probabilities for this network.
     """
     record = read_json_object(path, what="the last position of a train")
     stated = record.get("probability")
@@ -189,7 +189,7 @@ def decide_track(
     every_s: float = 10.0,
     prior: Mapping[str, float] | None = None,
 ) -> TrackDecision:
-    """Evaluate the posterior repeatedly, and decide for a track when the probability of all others is below `risk`.
+    """Evaluate the posterior repeatedly, and decide for a track when the other tracks' probability is below `risk`.
 
     `tracks`, `arms_m`, `errors` and `prior` are as in `track_posterior`. All `antennas` must have the same origin. The
     first evaluation is after `least_s` [s]; further evaluations follow every `every_s` [s]. A log shorter than
@@ -247,7 +247,7 @@ class WhichTrackOptions(Settings):
     """Options of `railfix which-track`.
 
     With `same_frame`, the base station's position is in the frame of the map. The train's position, which is computed
-    relative to the base station, is then in the same frame.
+    relative to the base station, is then also in the frame of the map.
     """
 
     spacing: float = option("Distance from the rear to the front antenna along the train.", 0.0, metavar="M", ge=0)
