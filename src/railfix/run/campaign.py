@@ -31,7 +31,7 @@ from railfix.run.output import check_folder
 from railfix.run.processor_setup import with_measured_priors
 from railfix.run.record import read_record
 
-#: Field in a pattern, such as ``{day}``.
+#: Regular expression of a field in a pattern, such as ``{day}``.
 _FIELD: Final = re.compile(r"\{(\w+)\}")
 
 
@@ -49,13 +49,13 @@ class Campaign(Settings):
     nav: str  #: Pattern of navigation files.
     track: tuple[str, ...]  #: Patterns of the files of the track, which are joined to a route in this order.
     rear: str = ""  #: Pattern of the logs of the rear antenna; may be empty.
-    sp3: str = ""  #: Pattern of precise orbits; may be empty.
+    sp3: str = ""  #: Pattern of the files with precise orbits; may be empty.
     vehicle: str = ""  #: Pattern of the vehicle file; may be empty.
     tachometer: str = ""  #: Pattern of the table of tachometer pulses; may be empty.
     inertial: str = ""  #: Pattern of the table of the inertial unit; may be empty.
     radar: str = ""  #: Pattern of the table of radar speeds; may be empty.
-    reference: str = ""  #: Pattern of the reference trajectory, for the campaign page; may be empty.
-    config: Path | None = None  #: Settings file of all runs.
+    reference: str = ""  #: Pattern of reference trajectories for the errors on the campaign page; may be empty.
+    config: Path | None = None  #: Settings file of all runs; None for the default settings.
     options: RunOptions = RunOptions()  #: Options of all runs.
 
 
@@ -74,7 +74,7 @@ class CampaignRun:
     config: Config
     options: RunOptions
     out: Path  #: Results folder.
-    reference: Path | None = None  #: File of the reference trajectory, or None.
+    reference: Path | None = None  #: File of the reference trajectory; None if there is none.
 
     @property
     def done(self) -> bool:

@@ -55,7 +55,7 @@ def navigation_span(navigation: Navigation) -> Span | None:
 
 
 def check_each_file(navigation: Navigation, log: Log) -> None:
-    """Raise MismatchError if a file of a log in several files begins more than a day from all navigation records."""
+    """For a log in several files, raise MismatchError if a file begins more than a day from all navigation records."""
     times = navigation_times(navigation)
     for path, first in log.first_epochs() if len(times) else ():
         if np.abs(times - first).min() > ANOTHER_DAY:

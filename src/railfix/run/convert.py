@@ -260,7 +260,7 @@ def _metres(values: np.ndarray) -> pl.Series:
 
 
 def _last_balise(rows: pl.DataFrame, passings: pl.DataFrame | None) -> pl.DataFrame:
-    """Return the balise last read up to each row (null if none), and its chainage (NaN if none)."""
+    """For each row, return the balise that was read last (null if none) and its chainage (NaN if none)."""
     empty = pl.DataFrame(schema={"read_gpst": pl.Datetime("ns"), "balise": pl.String, "chainage_m": pl.Float64})
     read = empty if passings is None else passings.filter(pl.col("verdict") == "read").select(empty.columns)
     times = rows.select(pl.col("time_gpst").cast(pl.Datetime("ns")))

@@ -323,8 +323,8 @@ def collect_notes(
 ) -> tuple[str, ...]:
     """Return the notes of a run without repetitions.
 
-    `causes` has the likely cause of positions off the map for each antenna. A map offset is noted if its test statistic
-    exceeds `note_statistic`.
+    `causes` has, for each antenna, the likely cause of positions off the map. A map offset is noted if its test
+    statistic exceeds `note_statistic`.
     """
     notes = [
         *line.notes,
@@ -369,7 +369,7 @@ def collect_notes(
     return tuple(dict.fromkeys(notes))
 
 
-#: Time scale that was probably used instead of GPS time, by the time-tag error to which it leads [s].
+#: For each time-tag error [s], the time scale that causes it if it is used instead of GPS time.
 _SCALES: Final = {-18.0: "UTC", -14.0: "BeiDou time", 19.0: "TAI"}
 
 

@@ -184,7 +184,7 @@ class RunInputs(InputFiles):
         return self
 
     def prepare(self, config: Config) -> tuple[Self, Config]:
-        """Check the inputs. Return them with the files that settings name; also return settings without "stream"."""
+        """Check the inputs, and add the files that settings name. In the returned settings, `sbas` is not "stream"."""
         self.check()
         config = self._with_own_sbas(config)
         inputs = self.with_settings(config)

@@ -50,7 +50,7 @@ class LocateSummary:
 
     epochs: int  #: Number of epochs.
     positions: int  #: Number of epochs with a position.
-    sigma_m: tuple[float, float, float]  #: Median standard deviations north, east and up [m].
+    sigma_m: tuple[float, float, float]  #: Medians of the positions' standard deviations north, east and up [m].
     notes: tuple[str, ...]
 
 
@@ -137,7 +137,7 @@ _BEIDOU_S: Final = 14
 #: Largest time-zone shift that is tested [h].
 _HOURS: Final = 14
 _FEET: Final = 0.3048
-#: A cause is not reported if the offset that it would produce differs by this or more from the height offset [m].
+#: A cause is not reported if the offset that it would produce differs by this or more from the positions' offset [m].
 _CAUSE_M: Final = 15.0
 #: A wrong height datum is considered as a cause only if the geoid is farther than this from the ellipsoid [m].
 _GEOID_M: Final = 10.0
@@ -179,7 +179,7 @@ def _shifts_s() -> Iterator[int]:
 def _offset_m(
     observations: Observations, received: Received, config: Config, line: Trajectory
 ) -> tuple[float, float, float, float] | None:
-    """Return horizontal and vertical offset of the median position from the line, line height and geoid height [m].
+    """Return horizontal and vertical offset of the median position from the line, and line and geoid height [m].
 
     Return None if no epoch has a position.
     """
@@ -208,7 +208,7 @@ def _cause_in_height(above_m: float, of_line_m: float, geoid_m: float) -> str:
     return f"{apart}; check the datum and the unit of the map's heights" if abs(above_m) > _HEIGHT_M else ""
 
 
-#: Advice for a map whose heights were probably read in the wrong datum.
+#: Advice for a map whose heights were probably read with the wrong datum.
 _AS_ORTHOMETRIC: Final = (
     "the heights of the map seem to be above the geoid, not the ellipsoid: give --height-datum orthometric --geoid "
     "egm96, or in a CSV file name their column elevation_m and give --geoid egm96"
@@ -347,7 +347,7 @@ class MeasuredFeature:
     """Feature detected in the combined values of all runs."""
 
     feature: Feature  #: Feature; its `arc_m` is a chainage.
-    places_m: Floats  #: Chainage of the feature in each of the R runs that show it by themselves, shape (R,) [m].
+    places_m: Floats  #: Chainage of the feature in each of the R runs in which it is also detected, shape (R,) [m].
     map_m: float  #: Chainage of the feature in the map [m], NaN if the map lacks it.
 
 

@@ -35,7 +35,7 @@ from railfix.track.network_route import find_route, left_out_note
 
 #: Interval of the matched positions [s].
 _INTERVAL_S: Final = 1.0
-#: A track of the route is near a position that is at most this far beyond its ends along the route [m].
+#: A track of the route is near a position on it, or at most this far beyond its ends along the route [m].
 _REACH_M: Final = 50.0
 #: Assumed bound on the relative difference between lengths in plan and lengths along the line. `_REACH_M` is increased
 #: by this fraction of the route length.
@@ -44,9 +44,9 @@ _LENGTHS_DIFFER: Final = 1e-3
 _LEAST_WRITTEN: Final = 1e-4
 #: Minimum probability at which a track outside the route is reported in the notes.
 _LEAST_NAMED: Final = 0.01
-#: Maximum number of alternatives reported in the notes; all are in ``run.json``.
+#: Maximum number of alternatives reported in the notes; all alternatives are in ``run.json``.
 _NAMED: Final = 8
-#: Largest gap between consecutive positions of one `Alternative` [s].
+#: A gap between positions that is longer than this ends an `Alternative` [s].
 _TOGETHER_S: Final = 60.0
 #: The log is taken to indicate an unmapped track if the track's probability exceeds this: twice the prior.
 _UNMAPPED_LIMIT: Final = 2.0 * UNMAPPED_PRIOR
@@ -86,9 +86,9 @@ class Alternative:
 
     track: str  #: Name of the alternative track.
     instead_of: str  #: Name of the route's track in this part.
-    first: np.datetime64  #: First epoch, GPS time.
+    first: np.datetime64  #: First epoch of the part, GPS time.
     last: np.datetime64
-    probability: float  #: Largest probability of the alternative track.
+    probability: float  #: Largest probability of the alternative track in this part.
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -116,7 +116,7 @@ class RouteOfLog:
 
     network: Network
     tracks: tuple[int, ...]  #: Indices of the route's tracks, in order.
-    #: Tracks of the most probable sequence that are not part of the route, because the train reversed on them.
+    #: Indices of tracks of the most probable sequence that the route omits, because the train reversed on them.
     left_out: tuple[int, ...]
     log: PlanLog  #: Matched positions in the frame of the network.
     matched: Matched  #: Tracks near each matched position, with their probabilities.

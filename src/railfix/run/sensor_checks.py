@@ -39,13 +39,13 @@ _LEAST_RATE_RADPS: Final = 0.003
 _REVERSED: Final = -0.3
 #: Turn rates are taken to be in deg/s if the slope of measured over expected turn rates exceeds this in magnitude.
 _IN_DEGREES: Final = 10.0
-#: Largest tested lag of the time tags [s].
+#: Lags of a sensor's time tags are tested up to this, early and late [s].
 _LONGEST_LAG_S: Final = 20.0
-#: Smallest reported lag of the time tags [s].
+#: Lags of a sensor's time tags relative to single-epoch positions are reported if they are at least this [s].
 _LEAST_LAG_S: Final = 2.0
 #: A lag is reported only if it reduces the unexplained variance by more than this factor.
 _LESS_ALIKE: Final = 2.0
-#: Largest accepted difference between the size of the median force and gravity, as a fraction of gravity.
+#: Largest accepted difference between the magnitude of the median force and gravity, as a fraction of gravity.
 _GRAVITY_SHARE: Final = 0.12
 
 
@@ -53,7 +53,7 @@ _GRAVITY_SHARE: Final = 0.12
 class PositionMotion:
     """Motion of an antenna, computed from positions averaged over M time cells; NaN if a neighbouring cell is empty."""
 
-    time: Datetimes  #: Shape (M,).
+    time: Datetimes  #: Mean time of each cell, shape (M,).
     speed_mps: Floats  #: Speed toward rising chainage, shape (M,).
     acceleration_mps2: Floats  #: Acceleration toward rising chainage, shape (M,).
     gradient: Floats  #: Gradient of the line (rise over horizontal length), shape (M,).
@@ -215,9 +215,9 @@ def _slope(expected: Floats, measured: Floats, least: float) -> float:
 _STEP_NS: Final = 500_000_000
 #: A sensor speed is compared only if the Doppler speeds before and after it are at most this far away [s].
 _NEAR_S: Final = 1.5
-#: Smallest reported relative scale error.
+#: Relative scale errors of speed sensors are reported if they exceed this.
 _SCALE: Final = 0.01
-#: Smallest reported lag of speeds [s].
+#: Lags of a speed sensor's time tags are reported if they are at least this [s].
 _LAG_S: Final = 0.3
 #: Relative scale error that wheel wear cannot cause; above it, the note suggests another number of pulses per turn.
 _OTHER_TEETH: Final = 0.1
@@ -225,14 +225,14 @@ _OTHER_TEETH: Final = 0.1
 _BETWEEN_S: Final = 3.0
 #: Ranges are not compared if the train moves by at most this between the two satellite positions [m].
 _MOVED_M: Final = 1.0
-#: Largest distance of a ground unit whose ranges are compared with satellite positions [m].
+#: Ranges are compared with satellite positions only if the ground unit is closer than this [m].
 _FAR_M: Final = 500.0
 #: Ground units are taken as ahead or behind if the cosine of their angle to the track exceeds this in magnitude.
 _AHEAD: Final = 0.7
 #: Ranges to units ahead (or behind) are compared only if there are at least this number of them.
 _LEAST_RANGES: Final = 10
-#: Smallest reported difference between measured ranges and ranges computed from satellite positions [m]. It is twice
-#: the assumed code error that lasts for minutes.
+#: Offsets of ranges from satellite positions are reported if they exceed this [m]: twice the assumed code error that
+#: lasts for minutes.
 _RANGE_M: Final = 3.0
 
 

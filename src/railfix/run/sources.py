@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from railfix.run.route import LogPositions, RouteOfLog
 
 
-#: Minimum length of a track [m].
+#: A track that is shorter than this is rejected [m].
 _SHORTEST_M: Final = 1.0
 #: Name of the file in the results folder that has the run's track, if the track differs from the input files.
 TRACK_FILE: Final = "track.csv"
@@ -260,7 +260,7 @@ class Log:
 
 
 Item = TypeVar("Item")
-#: Largest difference between two receivers' time tags of the same instant [ns].
+#: Time tags of two receivers that differ by at most this are taken to be of the same instant [ns].
 SAME_INSTANT_NS: Final = 20_000_000
 
 

@@ -41,7 +41,7 @@ _LOST, _HALF_CYCLE = 1, 2
 class StandstillCodes:
     """Code residuals of one antenna at rest, computed for the position `origin_ecef_m`: T epochs, K satellites."""
 
-    time: Datetimes  #: Shape (T,).
+    time: Datetimes  #: Time tags, shape (T,).
     #: Measured minus computed codes, minus their mean over the satellites of each clock group, shape (T, K). NaN where
     #: a satellite was not used.
     residual_m: Floats
@@ -50,7 +50,7 @@ class StandstillCodes:
     elevation_deg: Floats  #: Mean elevation of each satellite, shape (K,).
     common_m: Floats  #: Standard deviation of satellite and atmospheric errors, shape (K,).
     receivers: int  #: Number of receivers in the residuals: 2 if a base station's codes are subtracted, else 1.
-    origin_ecef_m: Floats  #: Shape (3,).
+    origin_ecef_m: Floats  #: Position for which the residuals are computed, ECEF, shape (3,).
     phases: StandstillPhases | None = None  #: Carrier phases; None without a base station.
 
     def fix(self, epochs: slice, errors: StandstillErrors) -> StandstillFix | None:
@@ -172,8 +172,8 @@ class StandstillPhases:
     difference_m: Floats
     lost: Masks  #: Whether a receiver reports a cycle slip since the previous epoch, shape (T, M).
     toward: Floats  #: Unit vectors to the satellites (east, north, up), shape (T, M, 3).
-    elevation_deg: Floats  #: Shape (T, M).
-    wavelength_m: Floats  #: Shape (M,).
+    elevation_deg: Floats  #: Elevation of each satellite, shape (T, M).
+    wavelength_m: Floats  #: Wavelength of each phase, shape (M,).
     group: Strings  #: Clock group and signal, shape (M,). Double differences are formed within a group.
     distance_m: float  #: Distance between the antenna and the base station [m].
 

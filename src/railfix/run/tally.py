@@ -77,7 +77,7 @@ class MapOffsetFound:
 class AntennaTally:
     """Counts of one antenna's epochs and observations."""
 
-    min_satellites: int = 3  #: Minimum number of satellites of a position.
+    min_satellites: int = 3  #: Minimum number of satellites that a position requires.
     judged: dict[str, bool] = field(default_factory=dict)  #: For each screen, whether it has tested any data.
     epochs: int = 0  #: Number of epochs.
     observed: int = 0  #: Number of epochs with at least one pseudorange.
@@ -89,16 +89,16 @@ class AntennaTally:
     status_positioned: Counter[str] = field(default_factory=Counter)  #: Number of epochs with coordinates, by status.
     #: Number of epochs with too few satellites, by decisive reason. Rejection reasons are applied in the order of their
     #: bits; the first after which too few satellites remain is decisive. The decisive reason is `not_observed` if too
-    #: few satellites were observed, and `used` if enough remained, but their clocks left no range.
+    #: few satellites were observed, and `used` if enough remained, but their clocks left no range for the position.
     short_first: Counter[str] = field(default_factory=Counter)
     #: For each rejection reason, number of epochs with too few satellites that would have enough without this reason.
     short_only: Counter[str] = field(default_factory=Counter)
-    #: Number of rejected observations by their first rejection reason.
+    #: For each rejection reason, number of observations whose first reason it is.
     first_reason: Counter[str] = field(default_factory=Counter)
-    #: Number of observations with only one rejection reason, by this reason.
+    #: For each rejection reason, number of observations that have only this reason.
     only_reason: Counter[str] = field(default_factory=Counter)
     satellites: Counter[str] = field(default_factory=Counter)  #: Number of observations by satellite.
-    #: Number of observations without a valid navigation record, by satellite.
+    #: For each satellite, number of observations without a valid navigation record.
     unrecorded: Counter[str] = field(default_factory=Counter)
 
     first: np.datetime64 | None = None
@@ -113,12 +113,12 @@ class AntennaTally:
     without_budget: int = 0
     #: Map offset with the largest test statistic; None if no window had enough positions.
     map_offset: MapOffsetFound | None = None
-    #: Number of epochs at which the filter excluded a satellite's codes as persistently wrong, and the first of these
-    #: epochs, by satellite.
+    #: For each satellite, number of epochs at which the filter excluded its codes as persistently wrong, and the first
+    #: of these epochs.
     left_out: dict[str, tuple[int, np.datetime64]] = field(default_factory=dict)
     #: Same as `left_out`, but for codes that single-epoch positioning excluded.
     lasting: dict[str, tuple[int, np.datetime64]] = field(default_factory=dict)
-    #: Number of epochs with a sign of interference, and the first of these epochs, by sign.
+    #: For each sign of interference, number of epochs with this sign, and the first of these epochs.
     interference: dict[str, tuple[int, np.datetime64]] = field(default_factory=dict)
     #: Smallest and largest time-tag error at epochs with suspected time tags [s], positive for late tags; NaN without
     #: such epochs.
@@ -176,7 +176,7 @@ class AntennaTally:
             self.tag_error_s = float(np.fmin(low, error.min())), float(np.fmax(high, error.max()))
 
     def _add_map_offset(self, result: AntennaResult) -> None:
-        """Keep the map offset with the largest statistic; ignore windows whose result is not in `_MAP_IN_QUESTION`."""
+        """Keep the most significant map offset of the windows whose interference result is in `_MAP_IN_QUESTION`."""
         offset, interference = result.map_offset, result.interference
         if not np.isfinite(offset.statistic).any():
             return
@@ -273,11 +273,11 @@ class AntennaTally:
 class Tally:
     """Counts of all antennas of a run."""
 
-    min_satellites: int = 3  #: Minimum number of satellites of a position.
+    min_satellites: int = 3  #: Minimum number of satellites that a position requires.
     antennas: dict[str, AntennaTally] = field(default_factory=dict)
     #: Notes of all chunks, as keys, in order of time.
     notes: dict[str, None] = field(default_factory=dict)
-    #: First epoch, number of epochs of all antennas, and processing time [s] of each chunk.
+    #: For each chunk: first epoch, number of epochs of all antennas, and processing time [s].
     chunks: list[tuple[np.datetime64, int, float]] = field(default_factory=list)
     order: AntennaOrder | None = None  #: Test for exchanged front and rear antennas; None with one antenna.
 

@@ -30,8 +30,8 @@ class PositionFigures:
     positions: int  #: Number of epochs with a position.
     passed: int  #: Number of epochs with the status `ok` (filter: `tracking` or `coasting`).
     statuses: Mapping[str, int]  #: Number of epochs by status, most frequent first.
-    chainage_first_m: float | None  #: Smallest chainage [m].
-    chainage_last_m: float | None  #: Largest chainage [m].
+    chainage_first_m: float | None  #: Smallest chainage of a position [m].
+    chainage_last_m: float | None  #: Largest chainage of a position [m].
     sigma_p50_m: float | None  #: Median standard deviation along the line [m].
     sigma_p95_m: float | None  #: 95th percentile of the standard deviation along the line [m].
     sigma_max_m: float | None  #: Largest standard deviation along the line [m].

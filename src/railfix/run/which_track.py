@@ -45,7 +45,7 @@ _ODOMETER_SHARE: Final = 0.05
 _ODOMETER_M: Final = 10.0
 #: A note is issued if the code position is farther from the most likely track than this [standard deviations].
 _NOTED_MISFIT: Final = 2.5
-#: Minimum probability of an unmapped track.
+#: A smaller probability of an unmapped track is raised to this value.
 _LEAST_UNMAPPED: Final = 1e-9
 
 
@@ -127,7 +127,7 @@ def prior_of_interlocking(text: str, network: Network) -> dict[str, float]:
 _NEAR_M: Final = 60.0
 #: Track points within this distance of the train are used [m].
 _POINTS_M: Final = 400.0
-#: Maximum number of hypotheses.
+#: Maximum number of tracks that are hypotheses.
 _MOST_TRACKS: Final = 64
 
 
