@@ -1,7 +1,7 @@
 """Numba-compiled functions on arrays for the along-track filter and for single-epoch positioning.
 
 A module of this package is imported when one of its functions is first used, because numba takes half a second to load.
-The functions operate only on arrays and numbers. The modules import only this package and `railfix.core` from railfix.
+The functions operate only on arrays and numbers. Of railfix, the modules import only `railfix.core` and this package.
 With ``NUMBA_DISABLE_JIT=1`` in the environment, the functions are plain Python, for a debugger and for tests.
 """
 

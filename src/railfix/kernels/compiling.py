@@ -48,7 +48,7 @@ def kernel(function: Function) -> Function:
         If no cache folder is writable.
     """
     if is_plain():
-        # Integer overflow, division by zero and NaN are intended: no warnings, as in machine code.
+        # Integer overflow, division by zero and NaN are intended, and cause no warnings in machine code.
         return np.errstate(all="ignore")(function)
     try:
         compiled = numba.njit(cache=True, **OPTIONS)(function)

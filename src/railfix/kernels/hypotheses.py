@@ -60,7 +60,7 @@ class _Work(NamedTuple):
 
 
 class _Sets(NamedTuple):
-    """Offset, sigma, and ratio of separation to threshold for consecutive sets of excluded channels."""
+    """Offset, sigma, and ratio of separation to threshold, each for several sets of excluded channels."""
 
     offset: Floats
     sigma: Floats

@@ -195,7 +195,7 @@ def _require(
 
 @inner
 def _lower(offset: Floats, bounds: Indices, highest: float, aim: float, room: _Room) -> tuple[float, int]:
-    """From `highest` on, find the level at which the tails sum to `aim`, and the kind that has the largest sum."""
+    """Find, below `highest`, the level at which the tails sum to `aim`, and the kind that has the largest sum."""
     level, spender, here, below, above = highest, 0, highest, 0.0, highest
     for number in range(_STEPS):
         _write_tails(offset, here, number == 0, room)

@@ -32,7 +32,7 @@ class Channels(NamedTuple):
     prior: Floats  #: Prior fault probability of each channel.
     bias: Floats  #: Whitened mean error.
     beyond: Floats  #: Whitened variance of errors other than the noise.
-    shared: Floats  #: Whitened covariance of each pair of channels due to clocks, shape (n, n).
+    shared: Floats  #: Whitened covariance of each pair of channels due to shared clocks, shape (n, n).
 
 
 class System(NamedTuple):
@@ -70,7 +70,7 @@ class RangeErrors(NamedTuple):
 
 @inner
 def of_ranges(left: Floats, ranges: RangeErrors) -> tuple[float, float, float]:
-    """Return bias, separation variance and position variance that range errors cause with the gains `left`."""
+    """Return bias, separation variance and position variance that range errors cause for the gains `left`."""
     bias, apart, total = 0.0, 0.0, 0.0
     for m in range(len(left)):
         bias += abs(left[m]) * ranges.bias[m]

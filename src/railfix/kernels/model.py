@@ -38,7 +38,7 @@ def _write_clock_covariance(totals: Floats, tie_sigma_m: Floats, rho: Floats, co
 
 @inner
 def _invert_scaled(matrix: Floats, scale: Floats, inverse: Floats) -> None:
-    """Invert a symmetric 3 x 3 matrix; NaN if it is singular. `matrix` is scaled to a unit diagonal in place."""
+    """Invert a symmetric 3 x 3 matrix; NaN if it is singular. `matrix` is overwritten by its scaled form."""
     for i in range(3):
         scale[i] = 1.0 / math.sqrt(matrix[i, i]) if matrix[i, i] > 0.0 else math.nan
     for i in range(3):
@@ -60,7 +60,7 @@ def linearise_ranges(
     ----------
     ranges : RangeArrays
     place_ecef_m : ndarray, shape (T, 3) [m]
-        Linearisation points; NaN without a position, for which design, misfit and covariance are NaN.
+        Linearisation points; NaN if there is no position (design, misfit and covariance are then NaN).
     axes : ndarray, shape (T, 3, 3)
         Unit vectors along which the position unknowns are measured.
     prior : ndarray, shape (3, 3) [1/m^2]
@@ -131,7 +131,7 @@ def linearise_ranges(
 
 @kernel
 def residuals(model: Any) -> tuple[Floats, Floats, Floats]:
-    """Compute step, residuals and redundancies of the best fit to the misfits in `ModelArrays` (see `LinearModel`)."""
+    """Compute position step, residuals and redundancies of the best fit to the misfits (fields of `LinearModel`)."""
     root_weight, clock, clock_covariance_m2, design, covariance_m2, _, misfit = model
     epochs, channels = root_weight.shape
     groups = clock_covariance_m2.shape[1]

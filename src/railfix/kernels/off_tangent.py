@@ -80,7 +80,7 @@ class _Residuals(NamedTuple):
     projector: Floats  # (M, M)
     residual: Floats  # (M,)
     rows: Floats  # (3, M)
-    whitened: Floats  # (4, M): root of the weight, and design; work space
+    whitened: Floats  # (4, M): square root of the weight, and design; work space
     clock: Indices  # (M,), work space
 
 

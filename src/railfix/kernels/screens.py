@@ -40,8 +40,8 @@ def suspicions(
 
     An offset is the sum of the metric since the jump, so that chunk boundaries have no effect. `metric` and `limit`
     have shape (T, M), in C order. `level_before` and `since_before`, shape (M,), are offsets and starts of suspicions
-    before the chunk; the start is `NEVER` without a suspicion. Return a mask of rejected codes; offsets, 0 where there
-    is no suspicion and NaN where the metric is NaN; and the starts of suspicions at the end of the chunk.
+    before the chunk; the start is `NEVER` if there is no suspicion. Return a mask of rejected codes; offsets, 0 where
+    there is no suspicion and NaN where the metric is NaN; and the starts of suspicions at the end of the chunk.
     """
     epochs, channels = metric.shape
     reject, level = np.zeros((epochs, channels), dtype=np.bool_), np.empty((epochs, channels))
@@ -159,7 +159,7 @@ def clock_steps(
     longest_s: float,
     least: int,
 ) -> tuple[Floats, tuple[Floats, Floats, Integers]]:
-    """Return the median over channels of code change minus Doppler change, shape (T,), and the next `before`.
+    """Return the median over channels of code change minus integrated Doppler, shape (T,), and the next `before`.
 
     `before` has the last code, Doppler and time of each channel, shape (K,). Values are not compared across a break or
     after more than `longest_s`. The median is NaN if there are fewer than `least` channels.
@@ -198,8 +198,8 @@ def holds(
 ) -> tuple[Masks, Masks, tuple[Integers, Integers]]:
     """Return two masks, shape (T, C), of conditions that have been true for `hold_ns`, and of active conditions.
 
-    A condition remains active for `release_s` (`integrity.interference.limits.hold_signs`). `before` has the duration
-    of each condition and the last time at which it counted as true, shape (C,). Also return the next `before`.
+    A condition that has counted as true stays active for `release_s` (`integrity.interference.limits.hold_signs`).
+    `before` has each condition's duration and last time as true, shape (C,). Also return the next `before`.
     """
     epochs, conditions = signs.shape
     run, last, previous = before[0].copy(), before[1].copy(), time_before

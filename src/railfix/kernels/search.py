@@ -77,7 +77,7 @@ def points_within(
     nodes: Indices,
     below: Indices,
 ) -> tuple[Indices, Indices, int]:
-    """Find the points of a line within a ball, with `SearchIndex.stretches`.
+    """Find the points of a line that are within a ball; `stretches` is a field of `SearchIndex`.
 
     Return the work array with the indices of the points, the other work array, and the number of points.
     """
@@ -260,8 +260,8 @@ def clear_of_sections(
 ) -> Floats:
     """For each of S sections, return the horizontal distance [m] within which the line follows the section's tangent.
 
-    `ecef_m`, shape (P, 3), has the points of the line, `tangent`, `across` and `length_m` have its sections. `section`
-    are the indices of the S sections. `stretches` is a field of `SearchIndex`.
+    `ecef_m`, shape (P, 3), are the points of the line; `tangent`, `across` and `length_m` describe its sections.
+    `section` are the indices of the S sections. `stretches` is a field of `SearchIndex`.
     """
     clear, sections, longest = np.full(len(section), CLEAR_M), len(length_m), length_m.max()
     nodes, below = np.empty(len(ecef_m) + FAN_OUT, dtype=np.intp), np.empty(len(ecef_m) + FAN_OUT, dtype=np.intp)

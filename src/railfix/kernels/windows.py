@@ -10,7 +10,7 @@ import numpy as np
 from railfix.core.arrays import Floats, Indices, Integers
 from railfix.kernels.compiling import kernel
 
-#: Length of a span, in windows; with exp(50) = 5e21, the terms neither overflow nor lose digits.
+#: Length of a span, in windows: terms of at most exp(50) = 5e21 neither overflow nor lose digits.
 SPAN: Final = 50.0
 _NAT: Final = np.iinfo(np.int64).min
 _NS: Final = 1_000_000_000

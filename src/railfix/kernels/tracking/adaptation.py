@@ -30,7 +30,7 @@ def mean_square(rows: Rows, own: slice, found: Fit) -> float:
 
 @inner
 def update_scale(log_scale: float, mean_square: float, dt: float) -> float:
-    """Return the log scale of a variance, updated with an epoch's mean square, which is ignored if it is NaN."""
+    """Return the log scale of a variance, updated with an epoch's mean square; a NaN mean square is ignored."""
     if not math.isnan(mean_square):
         log_scale += (1.0 - math.exp(-min(dt, 1.0) / constants.SCALE_S)) * math.log(mean_square)
     return min(max(log_scale, constants.LEAST_SCALE), constants.LARGEST_SCALE)
@@ -46,7 +46,7 @@ def update_doubt(monitors: Record, rows: Rows, found: Fit, dt: float) -> None:
         monitors.weak_motion_s = max(monitors.weak_motion_s - constants.MOTION_LEAK * dt, 0.0)
     misfit = 0.0 if math.isnan(motion) else 1.0 - motion
     for j in range(rows.sensor.start, rows.sensor.stop):
-        misfit = 0.0 if rows.channel[j] < ix.FORCE_COLUMN else misfit  # a wheel or radar measures the speed
+        misfit = 0.0 if rows.channel[j] < ix.FORCE_COLUMN else misfit  # 0 if a wheel or radar measures the speed
     monitors.motion_misfit += (1.0 - math.exp(-dt / constants.MOTION_FIT_S)) * (misfit - monitors.motion_misfit)
     if rows.code_s > 0.0:
         if code < constants.LOST_CODE_WEIGHT:
@@ -91,7 +91,7 @@ def update_bias(code_bias: float, innovation: float, code_s: float) -> float:
 
 @inner
 def is_faulty(code_bias: float) -> bool:
-    """Return True if a satellite's mean innovation is so large that its codes are excluded."""
+    """Return True if a satellite's codes are excluded because of their mean innovation."""
     return bool(code_bias > constants.BIAS_FAULTY or code_bias < constants.BIAS_SHORT)
 
 

@@ -23,7 +23,7 @@ def before_measurements(
 
     The measurements `row`, `value` and `variance`, shapes (M, N), (M,) and (M,), are in the order of the filter. They
     are processed backward. P, shape (N, N), is the covariance before the measurements. `vector`, shape (N,), and
-    `matrix`, shape (N, N), are the information j and J after the measurements. Return both before the measurements.
+    `matrix`, shape (N, N), are the information j and J after the measurements. Return j and J before the measurements.
     """
     count, size = row.shape
     P, x, gain = P.copy(), np.zeros(size), np.empty(size)

@@ -29,9 +29,9 @@ class Geometry(NamedTuple):
     point: Floats  #: Position at this epoch, ECEF [m]; shape (3,).
     axes: Floats  #: Tangent, right and up at this epoch's position; shape (3, 3).
     before: Floats  #: Position at the previous epoch, ECEF [m]; shape (3,).
-    #: Unit vector of the displacement since the previous epoch, or the tangent if it is below `CHORD_M`; shape (3,).
+    #: Unit vector of the displacement since the previous epoch, or tangent if shorter than `CHORD_M`; shape (3,).
     chord: Floats
-    distance: Floats  #: Range of each channel with measurements [m]; shape (K,).
+    distance: Floats  #: Distance to the satellite of each channel with measurements [m]; shape (K,).
     sight: Floats  #: Unit vectors to the satellites, ECEF; shape (K, 3).
     along: Floats  #: Components of `sight` along `axes`; shape (K, 3).
 
@@ -63,8 +63,8 @@ def linearise(
 ) -> None:
     """Write an epoch's equations, linearised at the arc lengths `at` [m] of this epoch and of the previous epoch.
 
-    The innovations are computed at the mean x; for the difference between x and `at`, they are linear. `wheel_sign` is
-    the result of `find_wheel_sign`.
+    The innovations refer to the mean x, and are linear in the difference between x and `at`. `wheel_sign` is the result
+    of `find_wheel_sign`.
     """
     geometry = _compute_geometry(given, t, at)
     _write_codes(given, t, rows, x, geometry, x[ix.ARC] - at[0], equations)
@@ -122,7 +122,7 @@ def _write_motion_quantities(first: int, x: Floats, at: tuple[float, float], equ
 def _write_codes(
     given: Given, t: int, rows: Rows, x: Floats, geometry: Geometry, moved: float, equations: Equations
 ) -> None:
-    """Write each code as row and quantity of one index; the mean is `moved` [m] ahead of the point in `geometry`."""
+    """Write each code as row and quantity of equal index; the mean is `moved` [m] ahead of the point in `geometry`."""
     unknown, coefficient = equations.unknown, equations.coefficient
     for j in range(rows.code.start, rows.code.stop):
         k = rows.channel[j]

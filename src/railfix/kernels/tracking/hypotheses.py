@@ -31,12 +31,12 @@ def clip_odds(odds: float, gained: float, reach: float) -> float:
 def reweigh(
     parameters: Record, state: State, evidence: Floats, code_evidence: Floats, points: Floats, arc: Floats, dt: float
 ) -> None:
-    """With the evidence of motion and codes, update the log probabilities, and separately their parts due to codes.
+    """Update the log probabilities with the evidence of motion and codes, and separately their parts due to codes.
 
     docs/filter-equations.md has the bounds of the evidence. They are required because errors are correlated over
     epochs: map errors permanently, motion errors for seconds, and code errors of all satellites on one side of a street
-    for minutes. The evidence of motion is therefore multiplied by the interval, at most 1 s. For laps within `ALIKE`
-    times `map_branch_m`, recent evidence of codes is stored as `log_recent`, which only `find_leading` uses.
+    for minutes. The evidence of motion is therefore multiplied by the interval, at most 1 s. For laps closer than
+    `ALIKE` times `map_branch_m`, recent evidence of codes is stored as `log_recent`, which only `find_leading` uses.
 
     `evidence` is the log evidence of motion, and `code_evidence` the log evidence of codes given the motion, shape
     (H,). `points`, shape (H, 3), and `arc`, shape (H,), are the positions [m].
@@ -108,8 +108,8 @@ def _merge_twins(given: Given, state: State, ranked: Indices) -> tuple[Indices, 
     """Return hypotheses and log probabilities after merging hypotheses with the same position.
 
     Two hypotheses are merged if their distance is less than the sum of their standard deviations. If another lap has a
-    hypothesis at the same position within the map error, the smaller standard deviation is the limit. Otherwise a right
-    position could be merged into a wrong position of the same lap, and the next bend would contradict this lap only.
+    hypothesis at the same position within the map error, the smaller standard deviation is the limit. With the sum, a
+    right position could be merged into a wrong position of the same lap, which the next bend would contradict.
     """
     kept, log_probability, size = np.empty_like(ranked), np.empty(len(ranked)), 0
     arc, points, axes = state.x[: len(ranked), ix.ARC], np.empty((len(ranked), 3)), np.empty((3, 3))

@@ -16,7 +16,7 @@ PHASE_CLOCK, DRIFT = 4, 5
 MAP_RIGHT, MAP_UP = 6, 7
 #: Code clock at this epoch [m].
 CODE_CLOCK: Final = 8
-#: Error of the displacement since the previous epoch according to the map: right, up, along [m].
+#: Error of the map's displacement between the previous and this epoch: to the right, up, along [m].
 STEP_RIGHT, STEP_UP, MAP_LENGTH_ERROR = 9, 10, 11
 #: Wheel scale-factor error (no unit), positive if the wheel distance is too short.
 WHEEL: Final = 12
@@ -43,7 +43,7 @@ PER_EPOCH: Final = (CODE_CLOCK, STEP_RIGHT, STEP_UP, MAP_LENGTH_ERROR)
 #: of the map's displacement, speed, drift.
 M_DISTANCE, M_CLOCK, M_RIGHT, M_UP, M_SPEED, M_DRIFT = 0, 1, 2, 3, 4, 5
 MOTION: Final = 6
-#: Largest number of unknowns in a quantity, and index of the code clock among them.
+#: Largest number of unknowns in a quantity, and index of the code clock among these unknowns.
 TERMS: Final = 7
 CLOCK_TERM: Final = TERMS - 1
 
@@ -53,15 +53,15 @@ CODE, PHASE, DOPPLER = 0, 1, 2
 WHEEL_COLUMN, RADAR_COLUMN, FORCE_COLUMN, PLACE_COLUMN, RANGE_COLUMN = 0, 1, 2, 3, 6
 #: Number of sensor kinds: one for each column before the ranges, and one for all ranges.
 SENSORS: Final = 7
-#: Sub-filters that follow the sub-filters of sensors, by excluded source: all Dopplers, all phases, codes of satellites
-#: ahead, codes of satellites behind, the map, no source (all satellites in view).
+#: Number of sub-filters that follow the sub-filters of sensors. They exclude all Dopplers, all phases, codes of
+#: satellites ahead, codes of satellites behind, the map, or no source (all satellites in view).
 OTHERS: Final = 6
 ALL_DOPPLERS, ALL_PHASES, CODES_AHEAD, CODES_BEHIND, WRONG_MAP, ALL_IN_VIEW = 0, 1, 2, 3, 4, 5
-#: Reasons for a position search before an epoch, as bits: the track is lost, measurements were missing for `GAP_S`, or
-#: motion contradicts the position.
+#: Reasons for a position search before an epoch, as bits: the position is lost, measurements were missing for `GAP_S`,
+#: or motion contradicts the position.
 LOST_TRACK, GAP, CONTRADICTED = 1, 2, 4
 #: State of a call's first epoch: not predicted; predicted, and position search completed; predicted, and position
-#: search completed after a loss of track.
+#: search completed after a loss of the position.
 NOT_SOUGHT, SOUGHT, SOUGHT_AS_LOST = 0, 1, 2
 
 
@@ -74,9 +74,9 @@ class TrackStatus(IntEnum):
     SEVERAL_BRANCHES = 1
     #: Predicted position: the epoch has no accepted measurement.
     COASTING = 2
-    #: Measurements contradict the track; the whole line is searched for the position.
+    #: Measurements contradict the previous position; the whole line is searched for the position.
     LOST = 3
-    #: No position: the predicted standard deviation exceeds 200 m.
+    #: No position: the standard deviation of the predicted position exceeds 200 m.
     EXPIRED = 4
     #: No position: no epoch so far had two redundant codes.
     NOT_STARTED = 5

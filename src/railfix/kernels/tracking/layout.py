@@ -129,7 +129,7 @@ class Trace(NamedTuple):
     row: Floats  #: Measurement matrix; shape (H, M, N). Rows of unused measurements are 0.
     value: Floats  #: Innovations, in the units of the measurements; shape (H, M).
     variance: Floats  #: Variances of white errors divided by weights, infinite for unused measurements; shape (H, M).
-    restarted: Masks  #: True for unknowns that have restarted; shape (H, N).
+    restarted: Masks  #: True for unknowns that restarted at the epoch; shape (H, N).
     kept: Indices  #: For each hypothesis after the epoch, its index before the epoch; shape (H,).
 
 
@@ -141,8 +141,8 @@ class Rows(NamedTuple):
     phase: slice
     doppler: slice
     sensor: slice
-    channel: Indices  #: Index of the channel of each row, for sensors of the column; shape (M,).
-    #: White variances, including the adapted scales [m2, (m/s)2, squared units of sensors]; shape (M,).
+    channel: Indices  #: Index of each row's channel, or of its column for sensors; shape (M,).
+    #: Variances of white errors, with adapted scales [m2, (m/s)2, squared units of sensors]; shape (M,).
     variance: Floats
     left_out: Masks  #: True for codes of satellites excluded as faulty; shape (M,).
     code_s: float  #: Interval that the codes represent [s]: 0 if codes are not used, `interval_s` if there are none.

@@ -22,7 +22,7 @@ from railfix.kernels.tracking.subfilters import find_other
 
 
 class Alternatives(NamedTuple):
-    """A alternative positions of the train with their probabilities; fields have shape (A,)."""
+    """Alternative positions of the train with their probabilities; all fields have shape (A,)."""
 
     #: Distance along the line from the reported position; 0 instead of distances above `start_separation_m`.
     along_m: Floats
@@ -81,7 +81,7 @@ def _find_subfilters(given: Given, t: int, state: State) -> Alternatives:
 
 @inner
 def _cross(positions: Alternatives, subfilters: Alternatives, risk: float, level: float) -> tuple[Alternatives, float]:
-    """Return the positions on other branches given a faulty source, and the risk of positions that are not returned.
+    """Return the positions on other branches if a source is faulty, and the risk of positions that are not returned.
 
     A fault shifts the positions on all branches equally along the line. Positions are not returned if their risk beyond
     `level` is negligible (`PAIR_SHARE`).
@@ -213,7 +213,7 @@ def join(one: Alternatives, other: Alternatives) -> Alternatives:
 
 @inner
 def solve_level(sigma: float, distance: Floats, alternatives: Alternatives, risk: float, start: float) -> float:
-    """Return the level at which the position and the alternatives, at the distances `distance`, together use the risk.
+    """Return the level at which the risks of the position and of the alternatives, at `distance`, sum to `risk`.
 
     The solution is found by Newton steps on the logarithm of the risk, within a bracket. The steps start at the largest
     level that a single alternative requires, because at lower levels, a branch can make the risk nearly constant.

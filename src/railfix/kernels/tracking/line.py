@@ -13,7 +13,7 @@ from railfix.kernels.tracking.layout import Record, Records
 
 @inner
 def wrap_arc(vertex: Records, line: Record, arc: float) -> float:
-    """Return the arc length; beyond an end of a closed line, shift it by whole laps into the line (`Line.round_m`)."""
+    """Return the arc length, shifted by whole laps into the line if it is beyond a closed end (`Line.round_m`)."""
     first, last = vertex[0].arc_m, vertex[-1].arc_m
     if arc > last and line.end_turn_m > 0.0:
         return float(arc - math.ceil((arc - last) / line.end_turn_m) * line.end_turn_m)
@@ -70,7 +70,7 @@ def gradient_at(vertex: Records, line: Record, arc: float) -> float:
 
 @inner
 def excess_beyond_end(line: Record, arc: float, sigma: float) -> float:
-    """Return the distance of a position beyond an open end of the line [m]; 0 within two standard deviations.
+    """Return the distance of a position beyond an open end of the line [m]; 0 up to two standard deviations.
 
     The line is continued straight beyond the end, because the train may leave the map.
     """

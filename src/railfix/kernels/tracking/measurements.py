@@ -109,7 +109,7 @@ def start_clocks(
 def _start_code_clocks(
     given: Given, t: int, rows: Rows, known: Masks, x: Floats, P: Floats, equations: Equations
 ) -> bool:
-    """Add the median code innovation to the code clock, and the medians of new constellations to the clock offsets.
+    """Add the median code innovation to the code clock, and median innovations of new constellations to clock offsets.
 
     At the first epoch, the first constellation defines the code clock. Return True at the first epoch.
     """

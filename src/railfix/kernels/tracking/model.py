@@ -19,7 +19,7 @@ from railfix.kernels.tracking.layout import Given, Record, Rows
 from railfix.kernels.tracking.line import write_point
 from railfix.kernels.tracking.update import add_row
 
-#: Minimum variances of displacements and of clocks that begin at an epoch [m2], so that covariances are regular.
+#: Least variances of the map's displacement error and of the phase clock [m2], so that covariances are regular.
 _LEAST_M2 = 1e-8
 _LEAST_CLOCK_M2 = 1e-6
 
@@ -144,7 +144,7 @@ def _add_noise(
     above = max(constants.MAP_ROUGHNESS_M, constants.HEIGHT_ROUGHNESS * line.sigma_height_m)
     P[ix.STEP_RIGHT, ix.STEP_RIGHT] = across**2 * changed + _LEAST_M2
     P[ix.STEP_UP, ix.STEP_UP] = above**2 * changed + _LEAST_M2
-    # The distance on the map is the distance travelled minus the length error, which affects codes but not phases.
+    # The distance on the map is the distance travelled minus the length error; this error affects codes, not phases.
     length = constants.MAP_SCALE_M**2 * math.exp(map_log_variance) * travel + constants.PHASE_WALK_M**2 * dt
     P[ix.ARC, ix.ARC] += length
     P[ix.MAP_LENGTH_ERROR, ix.MAP_LENGTH_ERROR] = length + _LEAST_M2
@@ -179,7 +179,7 @@ def restart(P: Floats, unknown: int, variance: float) -> None:
 def narrow_speed_range(parameters: Record, monitors: Record, rows: Rows, speed: float, sigma: float, dt: float) -> bool:
     """Return True if a speed can follow the previous speeds, and narrow the range of possible speeds with it.
 
-    With several hypotheses, the range is unbounded. Other speeds are accepted if they come from at least
+    With several hypotheses, the range is unbounded. Speeds outside the range are accepted if they come from at least
     `trusted_satellites` satellites or from codes alone, or if an on-board sensor is used. After a rejected speed, the
     range grows by the speed change of emergency braking, so that braking is followed from the next epoch on. Without a
     measurement, `sigma` is infinite, and the range grows at `service_acceleration_mps2`.

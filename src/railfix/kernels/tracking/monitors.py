@@ -1,6 +1,6 @@
 """Monitors of the filter's position: velocity across the line, open ends of the map, steps of all codes.
 
-The protection level is withheld if a monitor contradicts the position. If the contradiction persists, the track is
+The protection level is withheld if a monitor contradicts the position. If the contradiction persists, the position is
 lost, and the whole line is searched.
 """
 
@@ -20,7 +20,7 @@ from railfix.kernels.tracking.subfilters import find_other
 
 @inner
 def compute_contradiction(given: Given, t: int, state: State, h: int) -> float:
-    """Return the squared normalised difference between measured velocity and line; NaN if no velocity is measured.
+    """Return the squared normalised difference between measured velocity and motion along the line; NaN if unmeasured.
 
     The square is the sum of the squared components along and across the line. The smallest of three values is returned:
     at the estimated position, at one position ahead of it and at one behind it.

@@ -1,8 +1,8 @@
 """Recursion of the along-track filter over epochs.
 
-The steps of an epoch are: predict, choose measurements, correct each hypothesis, reweigh hypotheses, adapt, correct the
-sub-filters, monitor, prune, and write level and status. The position search (`railfix.tracking.search`) takes place
-outside the recursion, between prediction and update of an epoch.
+The steps of an epoch are: predict, choose measurements, correct each hypothesis, reweigh hypotheses, adapt the state,
+correct the sub-filters, monitor, prune, and write level and status. The position search (`railfix.tracking.search`)
+takes place outside the recursion, between prediction and update of an epoch.
 """
 
 from __future__ import annotations
@@ -163,7 +163,7 @@ def _reweigh_hypotheses(given: Given, t: int, state: State, rows: Rows, correcti
 
 @inner
 def _commit_update(given: Given, t: int, state: State, rows: Rows, corrections: list[Correction], shift: float) -> int:
-    """Store the corrected hypotheses, adapt, correct the sub-filters, and monitor; return the leading hypothesis."""
+    """Store the corrected hypotheses, adapt the state, correct sub-filters, monitor; return the leading hypothesis."""
     monitors = state.monitors[0]
     for h, one in enumerate(corrections):
         state.x[h], state.P[h] = one.x, one.P
@@ -249,7 +249,7 @@ def _finish(given: Given, t: int, leading: int, state: State, trace: Trace) -> N
 
 @inner
 def _write_place(given: Given, t: int, status: int, state: State, results: Results) -> None:
-    """Write position, speed, levels and status. `status` is replaced for several branches or doubts."""
+    """Write position, speed, levels and status. `status` is replaced if there are several branches or doubts."""
     parameters, monitors, result = given.parameters[0], state.monitors[0], results.epoch[t]
     x, P = state.x[0], state.P[0]
     sigma = math.sqrt(P[ix.ARC, ix.ARC])
@@ -326,8 +326,8 @@ def advance(
     """Process a span of epochs; return the epoch at which the recursion stopped, and reasons for a position search.
 
     The recursion stops at an epoch that requires a position search; the state is predicted to this epoch, but not
-    corrected. After the search, a call for this epoch alone with `index.SOUGHT` completes the epoch. With 0 as reasons,
-    it also stops before a restart, after an epoch without a finite position, and at the end of the span.
+    corrected. After the search, a call for this epoch alone with `index.SOUGHT` completes the epoch. The recursion also
+    stops, with 0 as reasons, before a restart, after an epoch without a finite position, and at the end of the span.
     """
     for t in range(span[0], span[1]):
         if sought == ix.NOT_SOUGHT:

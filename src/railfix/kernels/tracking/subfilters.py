@@ -119,7 +119,7 @@ def advance_subfilters(given: Given, t: int, state: State, rows: Rows, best: Cor
 
 @inner
 def _has_joined(x: Floats, P: Floats, best: Correction) -> bool:
-    """Return True if a sub-filter has the position and sigma of the filter within `JOINED` of its sigma."""
+    """Return True if position and sigma of a sub-filter are within `JOINED` sigmas of the filter's."""
     sigma = math.sqrt(P[ix.ARC, ix.ARC])
     near = abs(x[ix.ARC] - best.x_prior[ix.ARC]) < constants.JOINED * sigma
     return near and sigma < (1.0 + constants.JOINED) * math.sqrt(best.P_prior[ix.ARC, ix.ARC])

@@ -50,7 +50,7 @@ class Correction(NamedTuple):
     x_prior: Floats
     P_prior: Floats
     equations: Equations
-    #: Prior covariance of the quantities, shape (Q, Q), and prior variances for known code clock, shape (Q,).
+    #: Prior covariance of the quantities, shape (Q, Q), and prior variances for a known clock, shape (Q,).
     covariance: Floats
     without_clock: Floats
     fit: Fit
@@ -106,7 +106,7 @@ def correct(x: Floats, P: Floats, g: Floats, innovation: float, variance: float,
 
 @inner
 def predict_quantities(P: Floats, equations: Equations) -> tuple[Floats, Floats]:
-    """Return the covariance H P H' of the quantities, shape (Q, Q), and variances without code clock, shape (Q,)."""
+    """Return the covariance H P H' of the quantities, shape (Q, Q), and variances for a known clock, shape (Q,)."""
     unknown, coefficient = equations.unknown, equations.coefficient
     size = len(unknown)
     covariance, without_clock, g = np.empty((size, size)), np.empty(size), np.empty(len(P))

@@ -1,7 +1,7 @@
 """Antenna velocities from carrier-phase changes or Dopplers alone, without the line.
 
-Velocity and clock drift are fitted by reweighted least squares (Student's t errors), with a vertical velocity near 0.
-If the velocity points across the line, the position, the branch or the map is wrong.
+Velocity and clock drift are fitted by reweighted least squares (Student's t errors), with the vertical velocity assumed
+near 0. If the velocity points across the line, the position, the branch or the map is wrong.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def fit_velocity(h: Floats, y: Floats, r: Floats, count: int, up: Floats, veloci
 
     The first `count` rows are measurements ``y = h . v + drift``: coefficients h, shape (M, 4), range rates y [m/s] and
     their variances r, both of shape (M,). y is changed, and a vertical velocity of 0 is appended. The results are
-    written into `velocity`, shape (3,), and `covariance`, shape (3, 3), which is scaled by the residuals.
+    written into `velocity`, shape (3,), and, scaled by the residuals, `covariance`, shape (3, 3).
     """
     if count - 3 < REDUNDANT:
         return False
