@@ -18,7 +18,7 @@ from railfix.tracking.chunk import FORGOTTEN
 from railfix.tracking.epochs import Kind
 from railfix.tracking.limits import TrackingLimits
 
-#: Sensor name of each measurement kind.
+#: Name of the sensor of each measurement kind from `Kind.WHEEL` on.
 SENSORS: Final = {kind: kind.name.lower() for kind in Kind if kind >= Kind.WHEEL}
 #: Duration of a constellation fault until users are alerted [s] (ARAIM milestone 3 report: one hour).
 CONSTELLATION_FAULT_S: Final = 3600.0
@@ -78,7 +78,7 @@ class Budget:
     #: Two-sided normal quantile for the speed bound, which has a separate risk: `SPEED_SHARE` times the risk, divided
     #: equally among the sources.
     k_speed: float
-    k_speed_fault: tuple[float, ...]  #: As `k_fault`, for the speed bound.
+    k_speed_fault: tuple[float, ...]  #: For each `SourceKind`, the factor K for the speed bound.
 
 
 @lru_cache(maxsize=8)

@@ -29,14 +29,14 @@ class Step:
 
     dt: float  #: Interval since the previous epoch [s].
     satellite: Strings  #: Satellites whose errors are in the state, shape (N - ix.SATELLITES,).
-    trace: Trace | None = None  #: Measurements and restarted unknowns of the epoch; None without a hypothesis.
+    trace: Trace | None = None  #: Measurements and restarted unknowns of the epoch; None if there is no hypothesis.
     #: Means and covariances after the epoch, shapes (H, N) and (H, N, N).
     mean: Floats = field(default_factory=lambda: np.empty((0, 0)))
     covariance: Floats = field(default_factory=lambda: np.empty((0, 0, 0)))
     #: For each hypothesis, its index at the previous epoch, shape (H,); -1 if it is new.
     parent: Indices = field(default_factory=lambda: np.empty(0, dtype=np.intp))
-    splits: list[SplitHypothesis | None] | None = None  #: As `Sought.splits`.
-    tilt_scale: float = 1.0  #: As `GnssEpochs.tilt_scale`.
+    splits: list[SplitHypothesis | None] | None = None  #: For each hypothesis, the split that produced it, or None.
+    tilt_scale: float = 1.0  #: Error of the ionospheric model divided by its error in a quiet ionosphere.
 
 
 class Recursion:

@@ -46,7 +46,7 @@ class AccumulatedIncrement:
     start: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     number: int = -1  #: Number of periods from `start` to the last selected epoch; -1 before the first selected epoch.
     epochs: int = 0  #: Number of epochs since the last selected epoch.
-    #: Channels whose carrier phase has continued since the last selected epoch; None if this is the last epoch.
+    #: Channels whose carrier phase has continued since the last selected epoch; None if that was the last epoch.
     unbroken: frozenset[str] | None = None
     #: Sums of wheel distances [m], radar distances [m] and forces [m/s2]; sums of their variances; each of shape (3,).
     total: Floats = field(default_factory=lambda: np.zeros(3))
@@ -189,7 +189,7 @@ def carried_levels(
         columns[:, _KEPT.index("level_m")] = np.where(is_bounded(with_bank.status), with_bank.level_m, np.inf)
         times, values = np.concatenate([times, with_bank.time]), np.concatenate([values, columns])
     arc, speed, level, ground, noise, of_speed, separation, unchecked, amount, status = values[number].T
-    tau = seconds(tracked.time - times[number])  # NaN before the first epoch of the second filter
+    tau = seconds(tracked.time - times[number])  # NaN at epochs before the second filter's first epoch
     carried = line.nearest_m(arc, tracked.arc_m) + speed * tau
     # Growth of the position error since the second filter's last epoch: V tau + a tau^2 / 2, with the speed bound V.
     growth_m = of_speed * tau + 0.5 * limits.level_acceleration_mps2 * tau**2
@@ -228,7 +228,7 @@ def _useful(level_m: Floats) -> Floats:
 
 
 def _status(status: Codes, of_level: Floats, level_m: Floats) -> Codes:
-    """Replace the statuses `TRACKING` and `COASTING` of positions without a finite protection level."""
+    """Replace `TRACKING` and `COASTING` by `of_level` or `DOUBTFUL` where the protection level is not finite."""
     reason = np.where(np.isfinite(of_level), of_level, TrackStatus.DOUBTFUL).astype(np.int8)
     reason = np.where(is_bounded(reason), np.int8(TrackStatus.DOUBTFUL), reason)
     return np.where(is_bounded(status) & ~np.isfinite(level_m), reason, status).astype(np.int8)

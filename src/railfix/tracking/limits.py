@@ -61,7 +61,7 @@ class TrackingLimits(Settings):
     #: unknown C/N0 counts as 45 dB-Hz.
     doppler_floor_mps: float = Field(default=0.03, gt=0)
     doppler_zenith_mps: float = Field(default=0.05, gt=0)
-    #: Floor and zenith value for the change of a carrier phase between two epochs, in the noise formula of Dopplers.
+    #: Noise of carrier-phase changes between two epochs: floor and zenith value in the formula of the Doppler noise.
     phase_floor_m: float = Field(default=0.01, gt=0)
     phase_zenith_m: float = Field(default=0.01, gt=0)
     #: The assumed length error of the map increases if the mean code shift of half a minute exceeds this, in sigmas.
@@ -72,12 +72,12 @@ class TrackingLimits(Settings):
     level: Literal["on", "off"] = "on"
     #: Interval between epochs that the sub-filters use. Codes of neighbouring epochs have nearly the same errors.
     level_period_s: float = Field(default=1.0, gt=0)
-    #: Largest acceleration assumed between the bank's epochs. Emergency braking reaches 3 m/s2 (magnetic track brakes).
-    #: After a rejected speed, the range of accepted speeds grows at this rate.
+    #: Largest acceleration assumed between epochs that the sub-filters use. Emergency braking reaches 3 m/s2 (magnetic
+    #: track brakes). After a rejected speed, the range of accepted speeds grows at this rate.
     level_acceleration_mps2: float = Field(default=3.0, ge=0)
     #: Probability per hour that the error exceeds the protection level without a warning. P1 2.4 requires 1e-7.
     level_risk_per_hour: float = Field(default=1e-7, gt=0, lt=1)
-    #: Number of independent errors per hour. Code errors last about a minute.
+    #: Number of independent position errors per hour: code errors last about a minute.
     level_samples_per_hour: float = Field(default=60.0, gt=0)
     #: Probability that a satellite is faulty in one independent sample, because city multipath exceeds the assumed
     #: error. Two given satellites are faulty with the square of this probability. The value is an assumption.

@@ -29,7 +29,7 @@ class Line:
         self.ecef_m: Floats = trajectory.ecef_m  #: Points, shape (V, 3).
         self.segment: Floats = trajectory.tangent  #: Unit vectors of the segments, shape (V - 1, 3).
         self.joins_m = trajectory.joins_m
-        #: Standard deviations of the map across the line, and in height [m].
+        #: Standard deviations of the map error across the line, and in height [m].
         self.sigma_plan_m, self.sigma_height_m = trajectory.sigma_plan_m, trajectory.sigma_height_m
 
     @cached_property
@@ -62,7 +62,7 @@ class Line:
 
     @cached_property
     def closed(self) -> bool:
-        """True if the line is joined to itself at an end."""
+        """True if at least one end of the line is joined to a point of the line."""
         return bool(np.isfinite(self.joins_m).any())
 
     def round_m(self, arc_m: Floats) -> Floats:

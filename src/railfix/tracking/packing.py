@@ -1,4 +1,4 @@
-"""Conversion of state, settings and sensor measurements to the recursion's arrays, and of its results to a state."""
+"""Conversion of state, settings and sensor measurements to arrays of the recursion, and of results to a state."""
 
 from __future__ import annotations
 

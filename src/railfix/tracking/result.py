@@ -52,7 +52,7 @@ class Tracked(NotebookTable):
     level_noise_m: Floats  #: Protection level for noise alone, without faults or other branches, shape (T,).
     #: Bound of the speed error, used to propagate protection levels to later epochs, shape (T,).
     level_speed_mps: Floats
-    #: Largest difference between filter and sub-filter, shape (T,); NaN where levels are off.
+    #: Largest difference between the positions of filter and sub-filter, shape (T,); NaN where levels are off.
     separation_m: Floats
     #: Probability of faults that the level does not cover, such as a fault of the only constellation, shape (T,).
     unchecked_prior: Floats

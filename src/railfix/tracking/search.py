@@ -217,7 +217,7 @@ def _reset_monitors(state: TrackState, *, lost: bool, weak: bool) -> None:
 def _split_wide(
     state: TrackState, arc_m: Floats, wide: Masks, line: Line
 ) -> tuple[list[_Part], list[SplitHypothesis | None]]:
-    """Return narrow hypotheses at those positions `arc_m` [m] that lie within `wide` hypotheses, and `Sought.splits`.
+    """Return narrow hypotheses at those positions `arc_m` [m] that lie within `wide` hypotheses, and their splits.
 
     A narrow hypothesis is the wide hypothesis corrected by a position measurement of standard deviation
     `START_SIGMA_M`. Its probability is proportional to the density of the wide hypothesis at the measured position.

@@ -127,7 +127,7 @@ def smooth_steps(
 
 
 def _ionosphere_m2(step: Step, h: int, vector: Floats, matrix: Floats, quiet_m: float) -> float:
-    """Return the increase of the variance along the line [m^2] by an ionosphere that is not quiet, otherwise 0."""
+    """Return the increase of the variance along the line [m^2] by a disturbed ionosphere; 0 for a quiet ionosphere."""
     both = step.covariance[h][[ix.ARC, ix.SLOW_CODE]]
     P = both[:, [ix.ARC, ix.SLOW_CODE]] - both @ matrix @ both.T
     less = (1.0 - max(step.tilt_scale, 1.0) ** -2) / quiet_m**2
@@ -136,7 +136,7 @@ def _ionosphere_m2(step: Step, h: int, vector: Floats, matrix: Floats, quiet_m: 
 
 
 def _arrange(later: BackwardInformation, satellite: Strings) -> tuple[Floats, Floats]:
-    """Return information vector and matrix in the order of given satellites; 0 for satellites not in `later`."""
+    """Return information vector and matrix in the order of given satellites, zero for satellites not in `later`."""
     _, here, there = np.intersect1d(satellite, later.satellite, return_indices=True)
     to = np.concatenate([np.arange(ix.SATELLITES), ix.SATELLITES + here])
     of = np.concatenate([np.arange(ix.SATELLITES), ix.SATELLITES + there])

@@ -24,8 +24,8 @@ class Monitors:
     weak_code_s: float = 0.0  #: Time for which the mean weight of codes has been low [s].
     #: Logarithm of the ratio of the estimated Doppler variance to the variance assumed in `TrackingLimits`.
     log_doppler_scale: float = 0.0
-    log_phase_scale: float = 0.0  #: As `log_doppler_scale`, for carrier phases.
-    #: Mean position shift implied by the codes of the last epochs, in standard deviations.
+    log_phase_scale: float = 0.0  #: Log of the ratio of the estimated to the assumed variance of phase changes.
+    #: Exponentially weighted mean of the position shifts that codes imply, in standard deviations.
     code_shift: float = 0.0
     code_shift_variance: float = 0.0  #: Variance of `code_shift`.
     #: Logarithm (at least 0) of the ratio of the variance of map lengths to the assumed variance.
@@ -94,7 +94,7 @@ class TrackState:
     satellite: Strings = field(default_factory=lambda: np.empty(0, dtype="<U3"))
     #: Time at which each satellite was last observed, shape (N - ix.SATELLITES,).
     seen: Datetimes = field(default_factory=lambda: np.empty(0, dtype="datetime64[ns]"))
-    #: Mean innovation of each satellite's codes, shape (N - ix.SATELLITES,) (`kernels.tracking.adaptation`).
+    #: Mean normalised code innovation of each satellite, shape (N - ix.SATELLITES,) (`kernels.tracking.adaptation`).
     code_bias: Floats = field(default_factory=lambda: np.empty(0))
     #: True for receiver clocks that have been observed, shape (len(ix.CLOCKS),).
     offset_known: Masks = field(default_factory=lambda: np.zeros(len(ix.CLOCKS), dtype=np.bool_))
@@ -135,7 +135,7 @@ class TrackState:
 
 
 def _rearrange(mean: Floats, covariance: Floats, index: Indices, new: int) -> tuple[Floats, Floats]:
-    """Return means and covariances of the unknowns `index`, followed by `new` satellite errors of unit variance."""
+    """Return means and covariances of the unknowns `index` and of `new` further satellite errors of unit variance."""
     old = len(index)
     means, covariances = np.zeros((len(mean), old + new)), np.zeros((len(mean), old + new, old + new))
     means[:, :old], covariances[:, :old, :old] = mean[:, index], covariance[:, index[:, None], index]
