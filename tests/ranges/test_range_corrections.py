@@ -370,8 +370,8 @@ def test_a_model_of_an_earlier_version_is_noted() -> None:
         config = parse_config({"filter": "off", "error_model": "line.toml", "screens": []})
         notes[name] = EpochProcessor(config, cases.clean_trajectories(), models=Models(error_model=model)).notes
     assert [note for note in notes["old"] if note not in notes["new"]] == [
-        "error model: faults.side_upper, the frequency of common faults of low satellites on one side, is missing; "
-        "the file is of an earlier version, so make it again with railfix error-model"
+        "error model: faults.side_upper, bound of simultaneous faults of low satellites on one side, is missing; "
+        "the file is of an earlier version, so fit the model again with railfix error-model"
     ]
     assert set(notes["new"]) < set(notes["old"])
 

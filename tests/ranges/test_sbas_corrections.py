@@ -137,7 +137,7 @@ def test_type_6_of_the_same_issue_renews_the_correction_of_another_does_not() ->
     assert states(other, 16, 17) == [OK, TIMED_OUT]
     assert engine(same).satellites(at(9.0, 10.0), SATELLITE).udrei[:, 0].tolist() == [3, 2]
     assert engine(other).satellites(at(9.0, 10.0), SATELLITE).udrei[:, 0].tolist() == [3, 3]
-    assert engine(other).unused["UDREI of type 6 without a fast correction of their IODF"] > 0
+    assert engine(other).unused["UDREI of type 6 without a fast correction of the same IODF"] > 0
 
 
 def test_an_alarm_stops_a_satellite_at_once() -> None:
@@ -394,7 +394,7 @@ def test_type_0_stops_the_geo_for_a_minute_and_clears_what_it_said() -> None:
     # Mask, factors, parameters and long-term corrections come again by 123 s.
     assert states(rows, 90.5, 99.9)[0] == SatelliteState.NO_MASK
     assert states(rows, 130.0) == [OK]
-    assert "sent 1 messages of type 0 (do not use for safety): each stopped the GEO" in " ".join(engine(rows).notes)
+    assert "sent 1 messages of type 0 (do not use for safety): after each, the GEO" in " ".join(engine(rows).notes)
 
 
 def test_type_0_may_stand_for_type_2() -> None:

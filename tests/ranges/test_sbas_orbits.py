@@ -125,4 +125,4 @@ def test_the_service_says_where_its_satellite_is() -> None:
     degradation = received(week, (579600.0, stream.parameters(1)))
     for sent in ((first, second), (almanac,)):
         own = DfmcService(degradation.merge(real(week, *sent)), prn=122)
-        assert own.notes[-1].startswith("PRN 122 is, by its own messages, at 143.7 degrees east, 42,161 km from")
+        assert own.notes[-1].startswith("according to its own messages, PRN 122 is at 143.7 degrees east, 42,161 km")

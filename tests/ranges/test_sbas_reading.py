@@ -215,7 +215,7 @@ BROKEN = {
     "letters": ("2353 3 137 63 : 53FCxx", "not of the form 'week tow prn type"),
     "length": ("2353 3 137 63 : 53FC00", "6 hexadecimal digits"),
     "prn": (f"2353 3 12 63 : {digits(cases.message(63, 0), 64)}", "PRN 12 is not an SBAS PRN"),
-    "type": (f"2353 3 137 62 : {digits(cases.message(63, 0), 64)}", "stated message type is 62, the type in"),
+    "type": (f"2353 3 137 62 : {digits(cases.message(63, 0), 64)}", "stated message type is 62, but the"),
     "time": (f"2353 604800 137 63 : {digits(cases.message(63, 0), 64)}", "not a GPS time"),
 }
 
@@ -237,7 +237,7 @@ def test_a_broken_line_is_named(tmp_path: Path, fault: str) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("nothing of the kind\n", "does not begin an SBAS file"),
+        ("nothing of the kind\n", "is not the first line of an SBAS file"),
         ("# only a comment\n", "contains no SBAS message"),
         (f"{2.10:9.2f}           {'N: GPS NAV DATA':40s}RINEX VERSION / TYPE\n", "is a RINEX navigation file"),
         (as_rinex(a_log()).replace("END OF HEADER", "COMMENT"), "no END OF HEADER"),

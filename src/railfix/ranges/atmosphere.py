@@ -15,9 +15,9 @@ from railfix.core.constants import FREQUENCY_L1, SPEED_OF_LIGHT
 from railfix.core.geodesy import compute_angles, enu_axes, geodetic_from_ecef
 from railfix.core.timescale import SECONDS_PER_DAY, to_week
 
-#: Klobuchar coefficients broadcast by GPS on 2004-01-01, at moderate solar activity, which RTKLIB also uses if no
-#: coefficients were received. The vertical delay of this model is 2.8 m RMS over time of day and latitude; the models
-#: of five other days from 2005 to 2024 differ from it by 0.7 to 1.7 m RMS.
+#: Klobuchar coefficients broadcast by GPS on 2004-01-01 (moderate solar activity); RTKLIB also uses them if none were
+#: received. Their vertical delay is 2.8 m RMS over time of day and latitude; the delays from the coefficients of five
+#: other days from 2005 to 2024 differ from this delay by 0.7 to 1.7 m RMS.
 TYPICAL_KLOBUCHAR: Final = np.array([1.118e-8, -7.451e-9, -5.961e-8, 1.192e-7, 1.167e5, -2.294e5, -1.311e5, 1.049e6])
 #: Earth's radius divided by the radius of a thin ionospheric shell at a height of 350 km (DO-229D A.4.4.10.4).
 _SHELL: Final = 6_378.1363 / (6_378.1363 + 350.0)
@@ -30,7 +30,7 @@ def thin_shell_obliquity(elevation_deg: Floats) -> Floats:
 
 
 def vertical_delay_m(slant_m: Floats, elevation_deg: Floats, frequency_hz: Floats) -> Floats:
-    """Return the median vertical delay on L1 over the channels, shape (T,) [m]; 0 where no channel has a delay.
+    """Return the median of the channels' vertical L1 delays, shape (T,) [m]; 0 where no channel has a delay.
 
     `slant_m` and `elevation_deg` have shape (T, K); `frequency_hz` has shape (K,).
     """
@@ -39,7 +39,7 @@ def vertical_delay_m(slant_m: Floats, elevation_deg: Floats, frequency_hz: Float
 
 
 def geomagnetic_latitude(latitude: Floats, longitude: Floats) -> Floats:
-    """Return the geomagnetic latitude of the broadcast ionosphere model (IS-GPS-200, 20.3.3.5.2.5) in semicircles."""
+    """Return the geomagnetic latitude as defined by Klobuchar's model (IS-GPS-200, 20.3.3.5.2.5) in semicircles."""
     return np.asarray(latitude + 0.064 * np.cos((longitude - 1.617) * np.pi))
 
 
@@ -55,8 +55,8 @@ def klobuchar_delay_m(
     """Return the ionospheric delay of the broadcast model (IS-GPS-200, 20.3.3.5.2.5, figure 20-4), shape (T, M) [m].
 
     Latitude and longitude of the receiver have shape (T,), elevation and azimuth shape (T, M). `coefficients` are alpha
-    0 to 3 and beta 0 to 3. The delay on L1 is scaled by (f1/f)^2 to the carriers `frequency_hz`, shape (M,). The delay
-    is NaN at or below the horizon, and where an input is NaN.
+    0 to 3 and beta 0 to 3. The L1 delay is multiplied by (f1/f)^2 for the carriers `frequency_hz`, shape (M,). The
+    delay is NaN at or below the horizon, and where an input is NaN.
     """
     _, seconds_of_week = to_week(time)
     alpha, beta = np.array(coefficients, dtype=np.float64).reshape(2, 4)
@@ -73,7 +73,7 @@ def klobuchar_delay_m(
     period = np.maximum(polyval(magnetic, beta), 72_000.0)
     phase = 2.0 * np.pi * (local - 50_400.0) / period
     cosine = 1.0 + phase * phase * (-0.5 + phase * phase / 24.0)
-    # A NaN phase fails the comparison, so that the delay is NaN and not the night-time delay.
+    # A NaN phase fails the comparison, which makes the delay NaN instead of the night-time delay.
     delay = slant * np.where(np.abs(phase) >= 1.57, 5e-9, 5e-9 + amplitude * cosine)
     return np.asarray(SPEED_OF_LIGHT * delay * (FREQUENCY_L1 / frequency_hz) ** 2)
 
@@ -83,8 +83,8 @@ def saastamoinen_delay_m(
 ) -> Floats:
     """Return Saastamoinen's tropospheric delay in the standard atmosphere (Saastamoinen, 1972), shape (T, M) [m].
 
-    The hydrostatic and wet delays are mapped by 1/sin(elevation). Negative ellipsoidal heights are replaced by 0. The
-    delay is NaN where an input is NaN, at or below the horizon, and at heights outside -100 m to 10 km.
+    The hydrostatic and wet delays are mapped by 1/sin(elevation). Ellipsoidal heights from -100 m to 0 are replaced by
+    0. The delay is NaN where an input is NaN, at or below the horizon, and at heights below -100 m or above 10 km.
     """
     height = np.where((height_m >= -100.0) & (height_m <= 1e4), np.maximum(height_m, 0.0), np.nan)
     pressure = 1013.25 * (1.0 - 2.2557e-5 * height) ** 5.2568
@@ -98,7 +98,7 @@ def saastamoinen_delay_m(
 
 @dataclass(frozen=True, kw_only=True)
 class SeenFrom:
-    """Satellite directions at T epochs for K channels, from receiver positions accurate to hundreds of metres."""
+    """Satellite directions at T epochs for K channels; receiver positions need be known to hundreds of metres only."""
 
     receiver_ecef_m: Floats  #: Position of the receiver, shape (T, 3).
     latitude_deg: Floats  #: Geodetic latitude of the receiver, shape (T,).
@@ -128,10 +128,10 @@ class SeenFrom:
 class Delays:
     """Atmospheric delays, and sigma of the corrected ranges, T epochs by K channels."""
 
-    #: Ionospheric delay at the carrier frequency, shape (T, K); 0 if the model is off, NaN where SBAS has no delay.
+    #: Delays at the carrier frequency, shape (T, K); 0 if the model of the delay is off, NaN where SBAS has no delay.
     ionosphere_m: Floats
     troposphere_m: Floats
-    #: Sigma to be added to receiver noise, shape (T, K); 0 with received Klobuchar coefficients, NaN where unknown.
+    #: Sigma without receiver noise, (T, K); 0 if the Klobuchar coefficients were received, NaN where unknown.
     sigma_m: Floats
     reason: Bits  #: Rejection reasons (`Reason` bits) where a delay is unknown, shape (T, K).
 
@@ -145,7 +145,7 @@ def model_delays(
     ionosphere_sigma_m: float = 0.0,
     troposphere: str,
 ) -> Delays:
-    """Return the Klobuchar and Saastamoinen delays; the delay of a model that is off (`klobuchar` None) is 0."""
+    """Return the Klobuchar and Saastamoinen delays; 0 if the model is off (`klobuchar` None, `troposphere` "off")."""
     shape = seen.elevation_deg.shape
     ionosphere, troposphere_m, sigma = np.zeros((3, *shape))
     if klobuchar is not None:

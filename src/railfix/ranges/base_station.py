@@ -20,22 +20,22 @@ from railfix.ranges.sources import BaseDifferences, CorrectionSource, SourceDela
 Values = TypeVar("Values", Floats, Integers)
 #: A station epoch may be up to this time [s] later than the train's epoch, because the two receiver clocks differ.
 _SAME_S: Final = 0.05
-#: Largest age of the station's code errors [s]; without selective availability, they change by centimetres in 30 s.
+#: Code errors of the station older than this are not used [s]. They change by centimetres in 30 s.
 LONGEST_AGE_S: Final = 60.0
-#: Largest age of the station's phase errors [s]; they change by millimetres in a second.
+#: Phase errors of the station older than this are not used [s]. They change by millimetres in a second.
 _PHASE_AGE_S: Final = 1.1
-#: Sigma of the corrected ranges per kilometre between station and train [m]; ionospheric, tropospheric and orbit errors
-#: differ between the two sites.
+#: Part of the sigma of corrected ranges that is proportional to the distance between station and train [m/km]; it
+#: covers differences of ionospheric, tropospheric and orbit errors.
 _PER_KM_M: Final = 0.004
-LONGEST_KM: Final = 100.0  #: Largest distance at which the station is used [km].
+LONGEST_KM: Final = 100.0  #: Ranges are not corrected if the train is farther than this from the station [km].
 
 
 class BaseLimits(Settings):
     """Settings of the corrections by a base station."""
 
-    #: Standard deviation due to the station's smoothed multipath, in addition to the noise of the train's ranges [m].
+    #: Standard deviation of the corrections due to smoothed multipath of the station; without noise of the train [m].
     sigma_m: float = Field(default=0.3, gt=0)
-    #: Random walk of phase differences, used in place of `PhaseLimits.drift_m` [m/sqrt(s)].
+    #: Random walk of an ambiguity [m/sqrt(s)]; with a base station, it replaces `PhaseLimits.drift_m`.
     drift_m: float = Field(default=0.001, ge=0)
 
 
@@ -48,7 +48,7 @@ class BaseErrors:
     #: Satellite and signal of each channel, shape (S,).
     satellite: Strings
     signal: Strings
-    #: Corrected code minus geometric range and minus the constellation's receiver clock offset, shape (B, S). It is NaN
+    #: Corrected code minus geometric range and receiver clock offset for the constellation, shape (B, S). It is NaN
     #: where no code was observed.
     code_m: Floats
     #: Corrected phase minus geometric range and minus a clock offset common to all channels, shape (B, S). The
@@ -60,7 +60,7 @@ class BaseErrors:
         return len(self.time)
 
     def merge(self, later: BaseErrors) -> BaseErrors:
-        """Return these errors followed by `later`, for every channel that occurs in either."""
+        """Return these errors followed by `later`, for every channel that occurs in at least one of the two."""
         parts = (self, later)
         keys = sorted({key for part in parts for key in part.keys})
         return replace(
@@ -79,7 +79,7 @@ class BaseErrors:
         return list(zip(self.satellite.tolist(), self.signal.tolist(), strict=True))
 
     def drop_before(self, time: np.datetime64) -> BaseErrors:
-        """Return the epochs from `time` on, without channels that have no code error at these epochs."""
+        """Return the epochs from `time` on, only with channels whose code error is known at one of these epochs."""
         rows = self.time >= time
         seen = np.isfinite(self.code_m[rows]).any(axis=0)
         return replace(
@@ -97,9 +97,9 @@ class BaseErrors:
 
         `receiver_ecef_m` are approximate positions of the train, shape (T, 3).
 
-        For a channel that the station does not observe, another signal of the same band is used; the two signals are
-        assumed to differ by a constant per constellation. Where the station has no recent error, or is farther away
-        than `LONGEST_KM`, the errors are NaN and the arcs -1.
+        For a channel that the station does not observe, another signal of the same band is used; the errors of the two
+        signals are assumed to differ by a constant that is common to a constellation. Where the station has no recent
+        error, or is farther away than `LONGEST_KM`, the errors are NaN and the arcs -1.
         """
         shape = (len(time), len(satellite))
         of_band = {(name, code[:1]): k for k, (name, code) in enumerate(self.keys)}
@@ -126,7 +126,7 @@ class BaseErrors:
 
 
 def _on(values: Values, own: Sequence[tuple[str, str]], keys: Sequence[tuple[str, str]], blank: float) -> Values:
-    """Return values of the channels `own` in the order of `keys`; `blank` for channels that are not in `own`."""
+    """Rearrange `values` from the channels `own` to the channels `keys`; `blank` for channels that are not in `own`."""
     place = {key: k for k, key in enumerate(keys)}
     columns: Indices = np.array([place[key] for key in own], dtype=np.intp)
     full = np.full((len(values), len(keys)), blank, dtype=values.dtype)
@@ -141,7 +141,7 @@ class BaseStationSource:
     other: CorrectionSource  #: Source of satellite positions, clocks and delays.
     errors: BaseErrors
     limits: BaseLimits
-    floor_sigma_m: float  #: Error floor (`CodeNoise`) of code ranges without a station correction [m].
+    floor_sigma_m: float  #: Error floor (`CodeNoise`) of codes without a station correction [m].
     second: Literal["none", "optional", "required"] = "none"
 
     @property

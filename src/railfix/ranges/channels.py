@@ -15,7 +15,7 @@ from railfix.core.constants import CLOCK_GROUP
 from railfix.core.reasons import Reason
 from railfix.gnss.observations import carrier_frequency_hz
 
-#: Limits of plausible pseudoranges [m], wide enough for receiver clock offsets up to 33 ms.
+#: Codes outside these limits are implausible [m]; receiver clock offsets up to 33 ms are allowed for.
 PLAUSIBLE_CODE_M: Final = (1e7, 1e8)
 
 
@@ -37,7 +37,7 @@ SECOND_SIGNALS: Final[Mapping[str, tuple[str, ...]]] = {
     "C": ("7I", "7Q", "7X", "6I", "6Q", "6X", "5P", "5X", "5D"),
 }
 
-#: First and second signals that SBAS on L5 corrects, by constellation.
+#: First and second signals of the ionosphere-free codes that SBAS on L5 corrects, by constellation.
 DFMC_SIGNALS: Final[Mapping[str, tuple[tuple[str, ...], tuple[str, ...]]]] = {
     "G": (("1C",), ("5Q", "5X", "5I")),
     "E": (("1C", "1X", "1B"), ("5Q", "5X", "5I")),
@@ -93,26 +93,26 @@ def first_available(satellite: Strings, available: Masks) -> Masks:
 class Channels:
     """The M channels of a log, and the K channels selected by the settings."""
 
-    #: Columns of the selected channels in the observations, shape (K,). Channels of a receiver clock are adjacent. The
-    #: channels of a satellite are in order of preference.
+    #: Columns of the selected channels in the observations, shape (K,). Channels that share a receiver clock are
+    #: adjacent. The channels of a satellite are in order of preference.
     columns: Indices
     #: Satellite and signal of each selected channel, shape (K,).
     satellite: Strings
     signal: Strings
-    groups: tuple[slice, ...]  #: Slice of the selected channels for each receiver clock.
+    groups: tuple[slice, ...]  #: For each receiver clock, the slice of its channels.
     clocks: tuple[str, ...]  #: Letter of each receiver clock (`CLOCK_GROUP`).
     clock: Strings  #: Letter of the receiver clock of each channel, shape (K,).
-    frequency_hz: Floats  #: Carrier frequency of the selected channels, shape (K,).
-    every_frequency_hz: Floats  #: Carrier frequency of all channels of the log, shape (M,).
+    frequency_hz: Floats  #: Carrier frequency of each selected channel, shape (K,).
+    every_frequency_hz: Floats  #: Carrier frequency of each channel of the log, shape (M,).
     left_out: Integers  #: Reason why a channel is not selected, shape (M,); 0 for selected channels.
     member: Integers  #: 1 where a channel belongs to one of the S satellites, else 0; shape (M, S).
-    #: Columns of the second signals of each channel's satellite in order of preference, shape (K, P); -1 for none. P is
-    #: 0 if no second signals are wanted, else at least 1.
+    #: Columns, in the observations, of the second signals of each channel's satellite in order of preference, shape (K,
+    #: P); -1 for none. P is 0 if no second signals are wanted, else at least 1.
     second: Indices
-    second_signal: Strings  #: Second signals with constellation letter ("G5Q"), shape (K, P).
+    second_signal: Strings  #: Second signals with constellation letter ("G5Q"); "" for none; shape (K, P).
     second_ratio: Floats  #: Squared ratio of the first to the second frequency, shape (K, P).
-    second_noise: Floats  #: Noise of the second signals relative to L1 C/A, shape (K, P).
-    pair_names: tuple[str, ...]  #: Satellite and both signals of each pair of codes, length K * P.
+    second_noise: Floats  #: Noise of the second signals relative to L1 C/A at equal C/N0, shape (K, P).
+    pair_names: tuple[str, ...]  #: Satellite and signals of each pair of first and second code, length K * P.
     pair_groups: Integers  #: Group of each pair, shape (K * P,). The pairs of a group share a receiver delay.
 
     @cached_property
@@ -147,7 +147,7 @@ def select_channels(
     signals : mapping of str to sequence of str
         Signals of each constellation in order of preference.
     exclude : collection of str
-        Satellites or letters of constellations that are left out.
+        Satellites that are left out; a letter leaves out a constellation.
     second_signals : mapping of str to sequence of str, optional
         Second-frequency signals of each constellation in order of preference; none by default.
     glonass_channel : mapping of str to int, optional
@@ -156,7 +156,7 @@ def select_channels(
     Raises
     ------
     ValueError
-        A letter of `systems` denotes no constellation.
+        A letter of `systems` is not the letter of a constellation.
     """
     if unknown := [letter for letter in systems if letter not in CLOCK_GROUP]:
         raise ValueError(

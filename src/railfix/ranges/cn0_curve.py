@@ -1,9 +1,9 @@
-"""Mean C/N0 over elevation for one antenna and receiver, from a day under open sky (P1 2.3(1), figure 3).
+"""Mean C/N0 as a function of elevation, for one antenna and receiver, from a day under open sky (P1 2.3(1), figure 3).
 
 A curve is fitted for each constellation and signal. BeiDou and QZSS have satellites in two kinds of orbits; each kind
 has its own curve. The mean of each elevation bin excludes outliers (beyond three robust standard deviations from the
 median). Between bin centres the curve is interpolated by monotone cubics (PCHIP). Above the highest bin the last mean
-is used; below the lowest bin there is no curve. The file is TOML.
+is used; below the lowest bin there is no curve. Curves are stored in TOML files.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 __all__ = ["KINDS", "Cn0Curve", "Cn0CurveSource", "Cn0Mean", "SourceFile", "satellite_kind"]
 
 
-#: Numbers of BeiDou GEO (C01-C05, C59-C63) and IGSO satellites, at a height of 36 000 km (CSNO, constellation status).
+#: Numbers of the BeiDou GEO (C01-C05, C59-C63) and IGSO satellites, 36 000 km high (CSNO, constellation status).
 _BEIDOU_HIGH: Final = frozenset({*range(1, 11), 13, 16, 31, 38, 39, 40, 56, *range(59, 64)})
 _QZSS_GEO: Final = frozenset({7, 8})  #: Numbers of the geostationary QZSS satellites (IS-QZSS-PNT: PRN 199, 200).
 
@@ -59,7 +59,7 @@ def satellite_kind(satellite: str) -> str:
 class Cn0Mean:
     """Mean C/N0 in B elevation bins, for one signal and one kind of satellites."""
 
-    kind: str  #: Kind of satellites, a key of `KINDS`.
+    kind: str  #: Kind of the satellites, a key of `KINDS`.
     signal: str
     elevation_deg: Floats  #: Bin centres in ascending order, shape (B,).
     mean_dbhz: Floats  #: Mean C/N0 per bin, shape (B,).
@@ -70,7 +70,7 @@ class Cn0Mean:
         for name in ("elevation_deg", "mean_dbhz", "spread_db", "count"):
             values = getattr(self, name)
             if values.shape != self.elevation_deg.shape or values.ndim != 1 or not np.isfinite(values).all():
-                raise ValueError(f"{name} must be finite, one number per bin")
+                raise ValueError(f"{name} must have one finite number per bin")
             object.__setattr__(self, name, read_only(values))
         if len(self.elevation_deg) < 2 or not (np.diff(self.elevation_deg) > 0.0).all():
             raise ValueError("elevation_deg must have at least two values, in ascending order")
@@ -82,7 +82,7 @@ class Cn0Mean:
         return PchipInterpolator(self.elevation_deg, self.mean_dbhz)
 
     def at(self, elevation_deg: ArrayLike) -> Floats:
-        """Return the mean C/N0 at elevations [dB-Hz]; NaN below the lowest bin and where the elevation is NaN."""
+        """Return the mean C/N0 at the given elevations [dB-Hz]; NaN below the lowest bin and for NaN."""
         elevation = np.asarray(elevation_deg, dtype=np.float64)
         lowest, highest = self.elevation_deg[0], self.elevation_deg[-1]
         half = (self.elevation_deg[1] - lowest) / 2.0
@@ -109,7 +109,7 @@ class Cn0CurveSource(Settings):
     end: str = ""
 
     epochs: int = Field(default=0, ge=0, strict=True)
-    position_ecef_m: tuple[float, ...] = ()  #: Position of the antenna.
+    position_ecef_m: tuple[float, ...] = ()  #: Position of the antenna; () if not stated.
     railfix_version: str = ""
     file: tuple[SourceFile, ...] = ()
 
@@ -118,7 +118,7 @@ class Cn0CurveSource(Settings):
 class Cn0Curve:
     """Mean C/N0 as a function of elevation, for one antenna and receiver."""
 
-    means: tuple[Cn0Mean, ...]  #: One curve per kind of satellites and signal.
+    means: tuple[Cn0Mean, ...]  #: One curve for each combination of satellite kind and signal.
     source: Cn0CurveSource = field(default_factory=Cn0CurveSource)
 
     def __post_init__(self) -> None:
@@ -150,18 +150,18 @@ class Cn0Curve:
         return result
 
     def notes_for(self, header: ObservationHeader) -> tuple[str, ...]:
-        """Return notes on an antenna or a receiver that differs between the curve's log and `header`."""
+        """Return notes if `header` has another antenna or receiver than the log of the curve."""
         notes = []
         for what in ("antenna", "receiver"):
             ours, theirs = _plain(getattr(self.source, what)), _plain(getattr(header, what))
             if ours != theirs:
                 notes.append(
                     f"C/N0 curve was made with {what} '{ours or 'not named'}', "
-                    f"this log has '{theirs or 'not named'}': the limits may not fit"
+                    f"but this log has '{theirs or 'not named'}'; limits from the curve may not fit"
                 )
         return tuple(notes)
 
 
 def _plain(text: str) -> str:
-    """Return the name of an antenna or receiver with single spaces."""
+    """Return the name of an antenna or receiver, with repeated spaces reduced to one."""
     return " ".join(text.split())

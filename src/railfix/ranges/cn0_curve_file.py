@@ -1,4 +1,4 @@
-"""Read and write the mean C/N0 over elevation as TOML files."""
+"""TOML files of the mean C/N0 as a function of elevation."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def write_cn0_curve(curve: Cn0Curve, path: FilePath) -> None:
         }
         for mean in curve.means
     ]
-    comment = "Mean C/N0 over elevation, measured under open sky; belongs to this antenna and receiver only."
+    comment = "Mean C/N0 by elevation, measured under open sky; valid for this antenna and receiver only."
     source = {**curve.source.model_dump(), "position_ecef_m": np.round(curve.source.position_ecef_m, 3).tolist()}
     values = {"format": FORMAT, "source": source, "curve": curves}
     write_toml(path, values, what="curve", comment=comment)

@@ -1,4 +1,4 @@
-"""Fit of the mean C/N0 over elevation, per kind of satellite and signal."""
+"""Fit of the mean C/N0 as a function of elevation, for each combination of satellite kind and signal."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ _NORMAL_MAD: Final = 1.482_602_218_505_602
 class CurveFit(Settings):
     """Settings of the fit of a curve."""
 
-    bin_deg: float = Field(default=5.0, ge=0.1, le=30.0)  #: Width of the bins of elevation.
-    #: Minimum number of samples of a bin; a bin with fewer samples is left out.
+    bin_deg: float = Field(default=5.0, ge=0.1, le=30.0)  #: Width of the elevation bins.
+    #: Bins with fewer samples than this are left out.
     least_samples: int = Field(default=30, ge=1)
-    least_bins: int = Field(default=4, ge=2)  #: Minimum number of bins of a curve; no curve is fitted to fewer bins.
+    least_bins: int = Field(default=4, ge=2)  #: No curve is fitted to fewer bins than this.
     #: Samples farther from their bin's median than this many robust standard deviations are excluded as outliers.
     clip_sigma: float = Field(default=3.0, gt=0.0)
 
 
 class Cn0Samples:
-    """C/N0 and elevation collected from parts of a log, by kind of satellite and signal, in single precision."""
+    """C/N0 and elevation from the parts of a log, by satellite kind and signal; stored in single precision."""
 
     def __init__(self) -> None:
         self._parts: dict[tuple[str, str], list[NDArray[np.float32]]] = defaultdict(list)
@@ -63,7 +63,7 @@ def fit_cn0_curve(
     fit: CurveFit | None = None,
     source: Cn0CurveSource | None = None,
 ) -> Cn0Curve:
-    """Fit a curve of mean C/N0 over elevation for each kind and signal that has enough bins.
+    """Fit the mean C/N0 as a function of elevation for each satellite kind and signal with enough bins.
 
     `samples` is a `Cn0Samples` of an antenna under open sky, or an iterable of tuples of C/N0 (T, M), elevation (T, M),
     satellite (M,) and signal (M,). Raises ValueError if there are too few samples for any curve.
@@ -78,7 +78,7 @@ def fit_cn0_curve(
     fitted = tuple(mean for mean in means if mean is not None)
     if not fitted:
         raise ValueError(
-            f"no signal of a constellation has {fit.least_bins} elevation bins with {fit.least_samples} samples each"
+            f"no signal of any constellation has {fit.least_bins} elevation bins with {fit.least_samples} samples each"
         )
     return Cn0Curve(means=fitted, source=source or Cn0CurveSource())
 

@@ -22,14 +22,14 @@ from railfix.io.logs import read_navigation, scan_observations
 from railfix.ranges.cn0_curve import KINDS, Cn0Curve, Cn0CurveSource, SourceFile
 from railfix.ranges.cn0_curve_fit import Cn0Samples, CurveFit, fit_cn0_curve
 
-_SHORT_S: Final = 12 * 3600.0  #: A shorter log causes a note; P1 2.3(1) requires about a day.
-_DEFICIT_DBHZ: Final = 10.0  #: P1 (table 6) rejects a signal whose C/N0 is this far below the mean [dB-Hz].
-#: Lowest elevation [deg] of the samples that are compared with the curve, and fraction of these samples. If a larger
-#: fraction is `_DEFICIT_DBHZ` below the curve, a note is issued.
+_SHORT_S: Final = 12 * 3600.0  #: A log shorter than this causes a note [s]; P1 2.3(1) requires about a day.
+_DEFICIT_DBHZ: Final = 10.0  #: P1 (table 6) rejects a signal whose C/N0 is lower than the mean by more than this [dB].
+#: Of the samples above the first value [deg], at most the second value (a fraction) may be more than `_DEFICIT_DBHZ`
+#: below the curve; if there are more, a note is issued.
 _CHECKED_FROM_DEG, _REJECTED_SHARE = 15.0, 0.01
 #: A tracked satellite below this elevation [deg] indicates a wrong antenna position.
 _BELOW_DEG: Final = -5.0
-_BELOW_SHARE: Final = 0.05  #: A larger fraction of satellites below `_BELOW_DEG` is an error.
+_BELOW_SHARE: Final = 0.05  #: A larger fraction of samples below `_BELOW_DEG` is an error.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,11 +67,11 @@ def cn0_curve_from_log(
 ) -> Cn0Calibration:
     """Fit a curve to a receiver log of about a day, recorded with an antenna under open sky.
 
-    `position_ecef_m`, shape (3,), is the antenna position, accurate to a few kilometres; by default, the position in
-    the header is used. Raises InputFileError if a file is missing or of another kind, or if the log has no epochs or no
-    C/N0; SettingsError if neither the header nor the caller provides a position; MismatchError if tracked satellites
-    are below the horizon of the position, the navigation files have no orbit for the log, or there are too few samples
-    for any curve.
+    `position_ecef_m`, shape (3,), is the antenna position (an accuracy of kilometres suffices); by default, the
+    position in the header is used. Raises InputFileError if a file is missing or of another kind, or if the log has no
+    epochs or no C/N0; SettingsError if neither the header nor the caller provides a position; MismatchError if tracked
+    satellites are below the horizon at the position, the navigation files have no orbit for the log, or there are too
+    few samples for any curve.
     """
     records = read_navigation(list(navigation), broken_lines=broken_lines, date=date)
     samples, seen, below = Cn0Samples(), 0, 0
@@ -98,10 +98,10 @@ def cn0_curve_from_log(
     if below > _BELOW_SHARE * seen:
         raise MismatchError(
             f"{observations[0]}: {100.0 * below / seen:.0f} % of the tracked satellites are below the horizon "
-            "of the position; give the position of the antenna, or the navigation files of this day"
+            "at this position; give the position of the antenna, or the navigation files of this day"
         )
     if not samples.keys():
-        raise InputFileError(observations[0], "has no C/N0 (S1C, S2I, ...); log it in the receiver's RINEX output")
+        raise InputFileError(observations[0], "has no C/N0 (S1C, S2I, ...); enable it in the RINEX output")
     source = Cn0CurveSource(
         antenna=header.antenna,
         receiver=header.receiver,
@@ -129,7 +129,7 @@ def _notes(curve: Cn0Curve, samples: Cn0Samples, duration_s: float) -> tuple[str
     fitted = {(mean.kind, mean.signal) for mean in curve.means}
     without = [f"{KINDS.get(kind, kind)} {signal}" for kind, signal in samples.keys() if (kind, signal) not in fitted]  # noqa: SIM118
     if without:
-        notes.append(f"no curve, because of too few samples over elevation: {', '.join(without)}")
+        notes.append(f"no curve, because too few elevation bins have enough samples: {', '.join(without)}")
     for mean in curve.means:
         elevation, cn0 = samples.of(mean.kind, mean.signal)
         high = elevation >= _CHECKED_FROM_DEG
@@ -137,7 +137,7 @@ def _notes(curve: Cn0Curve, samples: Cn0Samples, duration_s: float) -> tuple[str
         if rejected > _REJECTED_SHARE * np.count_nonzero(high):
             share = 100.0 * rejected / np.count_nonzero(high)
             notes.append(
-                f"{KINDS.get(mean.kind, mean.kind)} {mean.signal}: {share:.1f} % of the open-sky samples lie "
-                f"{_DEFICIT_DBHZ:g} dB-Hz below the mean; these satellites differ in power, or the sky is obstructed"
+                f"{KINDS.get(mean.kind, mean.kind)} {mean.signal}: {share:.1f} % of the open-sky samples lie more than "
+                f"{_DEFICIT_DBHZ:g} dB below the mean; these satellites differ in power, or the sky is obstructed"
             )
     return tuple(notes)

@@ -19,13 +19,13 @@ from railfix.ranges.channels import PLAUSIBLE_CODE_M, Channels, first_available
 from railfix.ranges.range_sigma import CodeNoise, code_sigma_m
 from railfix.ranges.sources import BaseDifferences, CorrectionSource, SourceSatellites
 
-#: Smallest and largest plausible distance of navigation satellites from the Earth's centre [m].
+#: Satellites at a smaller or larger distance from the Earth's centre are rejected as implausible [m].
 ORBITS_M: Final = (2e7, 6e7)
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class AntennaRanges(NotebookTable):
-    """Corrected ranges of one antenna as input of the screens: T epochs by K channels."""
+    """Corrected ranges of one antenna, the input of the screens (tests of single ranges): T epochs by K channels."""
 
     time: Datetimes  #: Time tags, shape (T,).
     break_before: Masks  #: True where an epoch must not be differenced with the previous epoch, shape (T,).
@@ -52,15 +52,15 @@ class AntennaRanges(NotebookTable):
 class SecondCodes:
     """Second-frequency codes of satellites: T epochs by the K channels of the first codes."""
 
-    code_m: Floats  #: Code corrected by the models; NaN where missing; shape (T, K).
+    code_m: Floats  #: Code corrected like the first code; NaN where missing; shape (T, K).
     noise_m: Floats  #: Sigma of noise and multipath used for the weights, shape (T, K).
-    cn0_dbhz: Floats  #: Carrier-to-noise density, shape (T, K).
-    group_delay_m: Floats  #: Group delay subtracted from the code, shape (T, K).
-    #: Sigma of the group delay where only part of it is broadcast, in addition to `TwoFrequencyLimits.delay_sigma_m`;
-    #: shape (T, K).
+    cn0_dbhz: Floats  #: C/N0 of the second signal, shape (T, K).
+    group_delay_m: Floats  #: Group delay subtracted from the second code, shape (T, K).
+    #: Sigma of the part of the group delay that is not broadcast; 0 where all is broadcast.
+    #: `TwoFrequencyLimits.delay_sigma_m` is added in quadrature; shape (T, K).
     delay_sigma_m: Floats
     ratio: Floats  #: Square of the ratio of the first to the second frequency, shape (T, K).
-    pair: Integers  #: Index of satellite and signals in `Channels.pair_names`, shape (T, K).
+    pair: Integers  #: Index of the pair of first and second code in `Channels.pair_names`, shape (T, K).
     column: Integers  #: Column of the code in the observations, -1 where missing; shape (T, K).
 
 
@@ -71,7 +71,7 @@ class CorrectedRanges(AntennaRanges, OnDemand):
     observations: Observations
     channels: Channels
     satellites: SatelliteStates
-    #: Delays subtracted from the codes, shape (T, K); 0 if the model is off, NaN where SBAS has no delay.
+    #: Delays subtracted from the codes, shape (T, K); 0 if the model of a delay is off, NaN where SBAS has no delay.
     ionosphere_m: Floats
     troposphere_m: Floats
     #: Standard deviation of satellite and atmospheric errors, from SBAS or from `NominalErrors`; shape (T, K).
@@ -81,10 +81,10 @@ class CorrectedRanges(AntennaRanges, OnDemand):
     #: Overbounding sigma and largest nominal bias of each range from an error model; 0 without a model; shape (T, K).
     bound_sigma_m: Floats
     bias_m: Floats
-    #: True at epochs with an unidentified gross error, shape (T,). Noise and map estimates exclude these epochs.
+    #: True at epochs with a gross error in an unknown channel, shape (T,). Estimates of noise and map exclude them.
     unsure: Masks
-    second: SecondCodes | None = None  #: Second codes of the satellites (`find_second_codes`); None if not used.
-    base: BaseDifferences | None = None  #: Subtracted base-station corrections.
+    second: SecondCodes | None = None  #: Second codes of the satellites (`find_second_codes`), or None.
+    base: BaseDifferences | None = None  #: Base-station corrections in use, or None.
 
     @property
     def columns(self) -> Indices:
@@ -120,7 +120,7 @@ def find_satellites(
 ) -> SatelliteRanges:
     """Return satellite positions and clocks at the times of transmission ``t - code / c - dt_sv`` (P1 2.2(2)).
 
-    Of each satellite, the first plausible code in the order of `channels` is used; other codes have a rejection reason.
+    Of each satellite, the first plausible code in the order of `channels` is kept; other codes get a rejection reason.
 
     Parameters
     ----------
@@ -131,8 +131,8 @@ def find_satellites(
     source : CorrectionSource
         `BroadcastSource`, `SbasSource`, `DfmcSource` or `BaseStationSource`.
     max_age_s : float, optional
-        Largest difference between an epoch and a record's reference time, where this is shorter than the record's
-        validity.
+        Records are not used at epochs farther than this from their reference time; the limit applies only if it is
+        shorter than the validity of the record.
     """
     code = observations.code_m[:, channels.columns]
     reason = _reasons_of_codes(channels.satellite, code)
@@ -177,7 +177,7 @@ def corrected_ranges(
     satellites : SatelliteRanges
         Returned by `find_satellites`.
     near_ecef_m : array_like, shape (3,) or (T, 3) [m]
-        Approximate positions of the antenna, accurate to hundreds of metres (`positioning.approximate_position`).
+        Approximate positions of the antenna (`positioning.approximate_position`); hundreds of metres suffice.
     gross : ndarray of bool, shape (T, K), optional
         Codes with gross errors (`ApproximatePosition.gross`), which are rejected.
     noise : CodeNoise, optional
@@ -186,12 +186,12 @@ def corrected_ranges(
     Returns
     -------
     CorrectedRanges
-        Codes that cannot be used have a rejection reason; their values are kept, or NaN where a correction is missing.
+        Codes that cannot be used have a rejection reason; their values are NaN where a correction is missing.
 
     Raises
     ------
     ValueError
-        `near_ecef_m` has another shape.
+        `near_ecef_m` has neither of these shapes.
     """
     noise, time = noise or CodeNoise(), observations.time
     near = _check_near(near_ecef_m, len(time))

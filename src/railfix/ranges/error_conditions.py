@@ -15,10 +15,10 @@ class Conditions(Settings):
 
     systems: tuple[str, ...]  #: Letters of the constellations.
     signals: dict[str, tuple[str, ...]]  #: Signals of each constellation in order of preference.
-    screens: tuple[str, ...]  #: Active screens.
+    screens: tuple[str, ...]  #: Names of the active screens.
     elevation_mask_deg: float = Field(ge=0.0, lt=90.0)
-    codes: Literal["raw", "smoothed"]  #: Raw pseudoranges, or carrier-smoothed pseudoranges.
-    #: Delay models: "klobuchar", "saastamoinen", "off", or "sbas".
+    codes: Literal["raw", "smoothed"]  #: Pseudoranges are raw or carrier-smoothed.
+    #: Sources of the delays; "off": the delays are not corrected.
     ionosphere: Literal["klobuchar", "off", "sbas"]
     troposphere: Literal["saastamoinen", "off", "sbas"]
 
@@ -26,7 +26,7 @@ class Conditions(Settings):
 def condition_differences(
     first: Conditions, second: Conditions, *, names: tuple[str, str] = ("model", "run")
 ) -> tuple[str, ...]:
-    """Return a text such as "codes: model raw, run smoothed" for each field in which two conditions differ.
+    """Return a text such as "codes: model raw, run smoothed" for each field in which `first` and `second` differ.
 
     The order of screens and constellations does not matter; the order of signals, which is a preference, does.
     """

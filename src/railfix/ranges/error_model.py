@@ -35,12 +35,12 @@ __all__ = [
 ]
 
 
-#: Sets of samples for the statistics of a bin, from the bin's own samples to the samples of all bins.
+#: Sets of samples from which the statistics of a bin can be computed: the bin's own samples, or wider sets.
 POOLED: Final = ("own", "all azimuths", "all azimuths and C/N0", "all azimuths and elevations", "all")
 
 
 class ErrorBins(Settings):
-    """Edges of the bins."""
+    """Edges of the bins of elevation, azimuth and C/N0."""
 
     #: E + 1 edges in ascending order; values beyond the outer edges belong to the outer bins.
     elevation_deg: tuple[Annotated[float, Field(ge=0.0, le=90.0)], ...] = option(
@@ -96,11 +96,11 @@ class BinStatistics:
     #: Number of blocks in the bin. A block has the samples of one satellite in a time interval
     #: (`ErrorModelFit.block_s`); their errors are correlated.
     blocks: Integers
-    bias_m: Floats  #: Mean of the samples used for the bin.
-    sigma_m: Floats  #: Standard deviation of these samples.
-    bound_bias_m: Floats  #: Bias of the overbound of these samples (`error_model_fit.gaussian_overbound`).
-    bound_sigma_m: Floats  #: Sigma of this overbound.
-    pooled: Integers  #: Index into `POOLED`: own samples, or a wider set if the bin has too few blocks.
+    bias_m: Floats  #: Mean error of the samples used for the bin.
+    sigma_m: Floats  #: Standard deviation of the errors of these samples.
+    bound_bias_m: Floats  #: Bias of the overbound of these errors (`error_model_fit.gaussian_overbound`).
+    bound_sigma_m: Floats  #: Sigma of the overbound.
+    pooled: Integers  #: Index in `POOLED` of the set of samples used for the bin.
 
 
 class ErrorModelSource(Settings):
@@ -112,10 +112,10 @@ class ErrorModelSource(Settings):
     start: str = ""
     end: str = ""
     railfix_version: str = ""
-    files: tuple[tuple[str, str], ...] = ()  #: Name and SHA-256 of each file.
+    files: tuple[tuple[str, str], ...] = ()  #: Name and SHA-256 of each input file.
 
 
-LARGEST_PRIOR: Final = 0.05  #: With a larger upper bound of a fault prior, no protection level is finite.
+LARGEST_PRIOR: Final = 0.05  #: Bounds of fault priors above this allow no finite protection level.
 
 
 class FaultRate(Settings):
@@ -124,25 +124,25 @@ class FaultRate(Settings):
     #: A range is faulty if the error exceeds this multiple of the sigma that the protection level assumes for the
     #: range. Normal noise exceeds five sigmas, the multiple in use, with a probability of 6e-7.
     beyond_sigma: float = Field(gt=0)
-    ranges: int = Field(ge=0)  #: Number of used ranges.
-    faulty: int = Field(ge=0)  #: Number of faulty ranges.
+    ranges: int = Field(ge=0)  #: Number of ranges that passed every screen.
+    faulty: int = Field(ge=0)  #: Number of these ranges that are faulty.
     #: Number of blocks. A block has the ranges of one satellite in a time interval; blocks count as independent.
     blocks: int = Field(ge=0)
     faulty_blocks: int = Field(ge=0)  #: Number of blocks with a faulty range.
-    prior: float = Field(ge=0, le=1)  #: Fraction of used ranges that are faulty.
+    prior: float = Field(ge=0, le=1)  #: `faulty` divided by `ranges`.
     #: Upper end of the one-sided 95 % confidence interval of the prior (Clopper and Pearson), computed from the numbers
-    #: of blocks. The value is used for `local_prior`.
+    #: of blocks. It is used as `RiskBudget.local_prior` if `bounds_priors` is true.
     upper: float = Field(ge=0, le=1)
     #: Number of time intervals in which two or more satellites are faulty, divided by the number expected for
     #: independent satellites; 0 without faults.
     together: float = Field(ge=0)
-    #: Number of time intervals with at least two low satellites on a side of the track, summed over both sides.
+    #: Number of time intervals with at least two low satellites on one side of the track; each side counts separately.
     side_blocks: int = Field(default=0, ge=0)
     #: Number of these time intervals in which at least two of these low satellites were faulty.
     side_faulty_blocks: int = Field(default=0, ge=0)
     #: Upper end of the one-sided 95 % confidence interval of the probability that low satellites of one side are faulty
-    #: together, computed from `side_blocks` and `side_faulty_blocks`; 1 if `side_blocks` is 0. The value is used for
-    #: `side_prior` if it is small enough for a finite protection level.
+    #: together, computed from `side_blocks` and `side_faulty_blocks`; 1 if `side_blocks` is 0. It is used as
+    #: `RiskBudget.side_prior` if `bounds_priors` is true.
     side_upper: float = Field(default=1.0, ge=0, le=1)
     #: Stretches with more frequent local faults than the line as a whole (`faulty_stretches`): first and last chainage
     #: of each stretch [m].
@@ -159,12 +159,12 @@ class ErrorModel:
     """Errors of corrected pseudoranges by bin."""
 
     bins: ErrorBins
-    before: BinStatistics  #: Errors before the screens; the difference to `after` is the effect of the screens.
+    before: BinStatistics  #: Errors before the screens; compared with `after`, they show the effect of the screens.
     after: BinStatistics  #: Errors after the screens, from which weights and protection level are computed.
     #: "local": only multipath and receiver noise, because a reference station removed satellite and atmospheric errors.
     #: "satellite_and_atmosphere": in addition, satellite and atmospheric errors of the recorded days.
     covers: Literal["local", "satellite_and_atmosphere"]
-    #: Settings under which the model is valid. With None, a run's settings are not compared.
+    #: Settings under which the model is valid; if None, the settings of a run are not checked against the model.
     conditions: Conditions | None = None
     source: ErrorModelSource = field(default_factory=ErrorModelSource)
     #: Rate of local faults among the ranges to which the model was fitted; None if not measured.
@@ -173,7 +173,7 @@ class ErrorModel:
     def at(
         self, elevation_deg: ArrayLike, relative_azimuth_deg: ArrayLike, cn0_dbhz: ArrayLike
     ) -> tuple[Floats, Floats]:
-        """Return the overbounding sigma and bias of observations [m]; the arguments are broadcast to one shape.
+        """Return the overbounding sigma and bias of observations [m]; the arguments are broadcast as by NumPy.
 
         Sigma and bias are NaN where the direction is unknown or the model has no value.
         """
@@ -187,8 +187,8 @@ class ErrorModel:
         if self.faults is None or "side_upper" in self.faults.model_fields_set:
             return ()
         return (
-            "error model: faults.side_upper, the frequency of common faults of low satellites on one side, is "
-            "missing; the file is of an earlier version, so make it again with railfix error-model",
+            "error model: faults.side_upper, bound of simultaneous faults of low satellites on one side, is missing; "
+            "the file is of an earlier version, so fit the model again with railfix error-model",
         )
 
 
@@ -240,7 +240,7 @@ def _columns(statistics: BinStatistics) -> _Columns:
 def read_error_model(path: FilePath) -> ErrorModel:
     """Read an error model from its file.
 
-    Raises InputFileError if the file is missing, unreadable, not an error model or of version 1, or if an entry is
+    Raises InputFileError if the file is missing or unreadable, is no error model, or has version 1, or if an entry is
     missing or out of range.
     """
     file = read_model_file(

@@ -1,9 +1,9 @@
 """Fit of an error model to samples: statistics of bins, pooled where samples are few, and rate of local faults.
 
 A normal distribution shifted by +b bounds the upper half of the errors, and a normal distribution shifted by -b bounds
-the lower half (CDF overbounding, B. DeCleene, ION GPS 2000). Sums of independent errors are then also bounded, if the
-distribution after the shift is symmetric and has one peak (the two-step method of J. Blanch, T. Walter, P. Enge, 2019,
-doi:10.1109/TAES.2018.2876583). Neither property can be proven from samples.
+the lower half (CDF overbounding, B. DeCleene, ION GPS 2000). The shifted distributions also bound sums of independent
+errors, if the distribution of the errors is symmetric and unimodal after the shift (the two-step method of J. Blanch,
+T. Walter, P. Enge, 2019, doi:10.1109/TAES.2018.2876583). Neither property can be proven from samples.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from railfix.core.options import option
 from railfix.core.settings import Settings
 from railfix.ranges.error_model import POOLED, BinStatistics, ErrorBins, ErrorModel, FaultRate
 
-TAIL_SCORE: Final = 1.0  #: Samples beyond this standard score are the tail, which determines sigma.
+TAIL_SCORE: Final = 1.0  #: Samples beyond this standard score determine sigma.
 
 
 def gaussian_overbound(error_m: Floats) -> tuple[float, float]:
     """Return bias and sigma [m] of two normal distributions, shifted by +bias and -bias, that bound a sample (n,).
 
-    The k-th of n samples from either end is the quantile of probability ``k / (n + 1)``. Sigma is the least value that
-    bounds both tails (beyond one standard score) if the bias equals the absolute median. With this sigma, the bias is
-    the least value that bounds all samples. Beyond the largest sample the bound is an extrapolation by the normal
-    distribution. Raises ValueError for fewer than three samples, or a sample that is not finite.
+    Counted from either end, the k-th of n samples is the quantile of probability ``k / (n + 1)``. With the absolute
+    value of the median as bias, sigma is the least value that bounds both tails (beyond one standard score). With this
+    sigma, the bias is increased until it bounds all samples. Beyond the largest sample the bound is a normal
+    extrapolation. Raises ValueError for fewer than three samples, or if one is not finite.
     """
     if len(error_m) < 3 or not np.isfinite(error_m).all():
         raise ValueError("an overbound needs at least three samples, all finite")
@@ -50,8 +50,8 @@ class ErrorModelFit(Settings):
     """Settings of the fit of an error model."""
 
     bins: ErrorBins = Field(default_factory=ErrorBins)
-    #: Number of independent blocks below which a bin uses the samples of a wider set of bins. With 30 blocks, the
-    #: largest error is about the quantile of 2 standard scores, so that the samples include the beginning of the tail.
+    #: Number of independent blocks below which a bin uses the samples of a wider set of bins. The largest of 30 normal
+    #: errors is about two standard deviations from the mean, so that 30 blocks include the beginning of the tail.
     least_blocks: int = option(
         "Number of blocks (30 s of one satellite) below which a bin uses a wider bin's samples.", 30, metavar="N", ge=1
     )
@@ -62,7 +62,7 @@ class ErrorModelFit(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class ErrorSamples:
-    """Errors of single pseudoranges, n samples."""
+    """Errors of individual pseudoranges, n samples."""
 
     error_m: Floats  #: Error of the pseudorange, shape (n,).
     elevation_deg: Floats  #: Elevation of the satellite, shape (n,).
@@ -71,13 +71,13 @@ class ErrorSamples:
     #: Number of the sample's block, shape (n,). A block has the samples of one satellite in a time interval; their
     #: errors are correlated.
     block: Integers
-    used: Masks  #: Samples that passed every screen, shape (n,).
+    used: Masks  #: True for samples that passed every screen, shape (n,).
     sigma_m: Floats  #: Sigma that the run's protection level assumes for the range, shape (n,).
     chainage_m: Floats  #: Chainage of the train; NaN where unknown; shape (n,).
 
 
 def fit_bins(samples: ErrorSamples, which: Masks, fit: ErrorModelFit) -> BinStatistics:
-    """Return the statistics of all bins, computed from the samples that the mask `which` selects, shape (n,).
+    """Return the statistics of all bins, computed from the samples for which `which`, shape (n,), is true.
 
     A bin with fewer blocks than `ErrorModelFit.least_blocks` uses the samples of a wider set of bins, the first of the
     following sets with enough blocks: all azimuths at the bin's elevation and C/N0; all azimuths and C/N0 at the bin's
@@ -125,7 +125,7 @@ def _rows(order: Integers, start: Integers, of_set: Integers) -> Integers:
 
 
 def _members(shape: tuple[int, int, int]) -> tuple[Integers, ...]:
-    """Return, for each pooling level, the number of the set to which each bin belongs."""
+    """Return, for each pooling level, the index of the set to which each bin belongs."""
     e, _, c = (part.ravel() for part in np.indices(shape))
     own = np.arange(e.size)
     return own, e * shape[2] + c, e, c, np.zeros(e.size, dtype=np.int64)
@@ -173,9 +173,9 @@ def _cells(statistics: BinStatistics, axis: int, k: int) -> tuple[str, str, str,
     return f"{total:,}", f"{mean:+.2f}", f"{spread:.2f}", f"{np.nanmin(bound):.1f}-{np.nanmax(bound):.1f}"
 
 
-_BEYOND_SIGMA: Final = 5.0  #: Multiple of the sigma of a range above which an error is a fault.
+_BEYOND_SIGMA: Final = 5.0  #: A range is faulty if its error exceeds this multiple of its sigma.
 _CONFIDENCE: Final = 0.95  #: Confidence level of the bounds of fault rates.
-#: Satellites up to this elevation [deg] count as low; it equals `RiskBudget.side_elevation_deg`.
+#: Satellites below this elevation [deg] count as low; the limit equals `RiskBudget.side_elevation_deg`.
 _SIDE_ELEVATION_DEG: Final = 45.0
 #: Length of the parts of the line that are compared with the whole line [m].
 _STRETCH_M: Final = 100.0
@@ -185,7 +185,7 @@ _SATELLITES: Final = 1_000_000
 
 
 def fault_rate(samples: ErrorSamples) -> FaultRate:
-    """Return the rates of local faults of ranges, and of faults common to a side of the track.
+    """Return the rates of local faults of single ranges, and of simultaneous faults on one side of the track.
 
     Only ranges that passed every screen are counted.
     """
@@ -219,7 +219,7 @@ def _upper(hits: int, trials: int) -> float:
 
 
 def _sides_of_two(samples: ErrorSamples, which: Masks) -> int:
-    """Count time intervals in which the samples `which` have two or more satellites on a side; sum over both sides."""
+    """Count intervals with two or more satellites on a side in the samples `which`; sides count separately."""
     right = np.sin(np.radians(samples.relative_azimuth_deg[which])) > 0.0
     one = np.unique(np.stack([right.astype(np.int64), samples.block[which]], axis=1), axis=0)
     _, satellites = np.unique(np.stack([one[:, 0], one[:, 1] // _SATELLITES], axis=1), axis=0, return_counts=True)
@@ -231,8 +231,8 @@ def faulty_stretches(samples: ErrorSamples) -> tuple[tuple[float, float], ...]:
 
     A stretch is reported if the lower limit (Clopper and Pearson, one-sided) of the fraction of faulty blocks on the
     stretch exceeds the upper limit of this fraction on the whole line; neighbouring stretches are joined. The prior of
-    the line does not bound local faults on these stretches, and the setting `Config.no_level_m` excludes protection
-    levels on them.
+    the line does not bound local faults on these stretches; the setting `Config.no_level_m` suppresses the protection
+    levels there.
     """
     used = samples.used & np.isfinite(samples.error_m) & np.isfinite(samples.sigma_m) & np.isfinite(samples.chainage_m)
     faulty = used & (np.abs(samples.error_m) > _BEYOND_SIGMA * samples.sigma_m)
@@ -255,7 +255,7 @@ def faulty_stretches(samples: ErrorSamples) -> tuple[tuple[float, float], ...]:
 
 
 def _together(every: Integers, bad: Integers) -> float:
-    """Return the ratio of observed to expected time intervals with two or more faulty satellites; 0 without faults."""
+    """Return the observed over the expected number of intervals with several faulty satellites; 0 without faults."""
     if not len(bad):
         return 0.0
     times, satellites = np.unique(every // _SATELLITES, return_counts=True)

@@ -12,7 +12,7 @@ from railfix.core.settings import Settings
 from railfix.ranges.atmosphere import thin_shell_obliquity
 
 _CN0_REFERENCE_DBHZ: Final = 45.0  #: C/N0 to which `zenith_sigma_m` refers.
-_CN0_CAP_DBHZ: Final = 50.0  #: C/N0 above which sigma does not decrease further.
+_CN0_CAP_DBHZ: Final = 50.0  #: Above this C/N0, sigma does not decrease further.
 
 
 class CodeNoise(Settings):
@@ -22,10 +22,10 @@ class CodeNoise(Settings):
     """
 
     model: Literal["cn0_elevation", "elevation"] = "cn0_elevation"  #: "elevation" omits the C/N0 factor.
-    #: Standard deviation at the zenith and the reference C/N0. Only ratios of sigmas affect the position, because the
-    #: noise scale of the receiver is estimated from the residuals (`pipeline.AntennaState`).
+    #: Standard deviation of a satellite at the zenith with 45 dB-Hz, without the floor. Only ratios of sigmas affect
+    #: the position, because the noise scale of the receiver is estimated from residuals (`pipeline.AntennaState`).
     zenith_sigma_m: float = Field(default=1.0, gt=0)
-    #: Error floor: residual errors of satellite clock and orbit, ionosphere and troposphere.
+    #: Error floor: sigma of residual errors of satellite clock and orbit, ionosphere and troposphere.
     floor_sigma_m: float = Field(default=1.0, ge=0)
 
 
@@ -43,31 +43,31 @@ def code_sigma_m(cn0_dbhz: Floats, elevation_deg: Floats, *, noise: CodeNoise | 
     return np.asarray(np.hypot(sigma, noise.floor_sigma_m))
 
 
-#: `satellite_sigma_m` covers accuracies stated in records (URA, SISA) up to this value [m]; 2 to 4.85 m are usual. A
-#: worse accuracy is added to the sigma of the satellite's ranges.
+#: `satellite_sigma_m` covers accuracies stated in records (URA, SISA) up to this value [m]; 2 to 4.85 m are usual. If a
+#: record states more, the stated value is added in quadrature to the sigma of the satellite's ranges.
 _USUAL_ACCURACY_M: Final = 5.0
 
 
 class NominalErrors(Settings):
-    """Assumed standard deviations of errors that a local error model does not cover, for ranges without SBAS.
+    """For ranges without SBAS: assumed standard deviations of the errors that a local error model does not cover.
 
     ``sigma^2 = satellite^2 + max(ionosphere F(el), share I)^2 + (troposphere m(el))^2`` with the mappings of DO-229D
     (A.4.4.10.4 and A.4.2.4) and the modelled slant delay I.
     """
 
-    #: Orbit and clock error in the range. This error is about half a metre for GPS and Galileo; their service
-    #: definitions state 2 m as the 95 % bound.
+    #: Sigma of the range error due to orbit and clock. The error is about half a metre for GPS and Galileo; their
+    #: service definitions state 2 m as the 95 % bound.
     satellite_sigma_m: float = Field(default=0.8, ge=0)
-    #: Vertical delay error of the Klobuchar model. The error is mostly common to all satellites, but treated as
+    #: Sigma of the vertical delay of the Klobuchar model. The error is mostly common to all satellites, but treated as
     #: independent.
     ionosphere_sigma_m: float = Field(default=1.0, ge=0)
     #: Minimum ionospheric sigma as a fraction of the modelled slant delay; DO-229D J.2.3 uses one fifth. If this
-    #: fraction of the vertical delay exceeds 1 m, the filter's sigma and protection level also increase. They do not
-    #: increase if SBAS or a base station corrects the ionosphere. 0 disables the minimum.
+    #: fraction of the vertical delay exceeds 1 m, the sigma of the filter and protection level also increase. They do
+    #: not increase if SBAS or a base station corrects the ionosphere. 0 disables the minimum.
     ionosphere_share: float = Field(default=0.2, ge=0)
-    #: Additional vertical delay error of typical Klobuchar coefficients; it is also added to the sigma of the ranges.
+    #: Additional sigma of the vertical delay if typical Klobuchar coefficients are used because none were received.
     typical_ionosphere_sigma_m: float = Field(default=2.0, ge=0)
-    #: Vertical delay error of the standard atmosphere (DO-229D A.4.2.4).
+    #: Sigma of the vertical delay of the standard atmosphere (DO-229D A.4.2.4).
     troposphere_sigma_m: float = Field(default=0.12, ge=0)
 
     def sigma_m(self, elevation_deg: Floats, ionosphere_m: Floats) -> Floats:

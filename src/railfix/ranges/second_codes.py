@@ -23,10 +23,10 @@ from railfix.ranges.sources import CorrectionSource
 def find_second_codes(corrected: CorrectedRanges, source: CorrectionSource, noise: CodeNoise) -> CorrectedRanges:
     """Return the ranges with the second code of each satellite, corrected like the first code.
 
-    The second code is the first signal, in order of preference, that is observed, healthy and has a group delay.
-    Satellite position and clock are the same as for the first code, and the group delay is from the same record; where
-    the record lacks a part of the group delay, a record of another message type is used. Where `source` requires second
-    codes, satellites without a second code are rejected with the reason `sbas_no_ionosphere`.
+    The second code is from the first signal, in order of preference, that is observed and healthy and has a group
+    delay. Satellite position and clock are the same as for the first code, and the group delay is from the same record;
+    where the record lacks a part of the group delay, a record of another message type is used. Where `source` requires
+    second codes, satellites without a second code are rejected with the reason `sbas_no_ionosphere`.
     """
     channels = corrected.channels
     second = _correct_second_codes(corrected, source.navigation, noise) if channels.second.shape[1] else None
@@ -113,9 +113,9 @@ def signal_delays(navigation: Navigation, signal: str) -> tuple[Floats, Floats, 
     return delay, sigma, unhealthy(records, signal)
 
 
-#: Standard deviation of the delay on L2 and L5 without ISC [m]. For GPS satellites whose CNAV had ISC on 2025-02-15,
-#: the difference between TGD - ISC and the delay used without ISC has a standard deviation of 0.24 m on L2C and 0.55 m
-#: on L5Q (`tests/gnss/test_group_delays.py`).
+#: Standard deviation of the group delay on L2 and L5 if the inter-signal corrections (ISC) are missing [m]. For GPS
+#: satellites whose CNAV had ISC on 2025-02-15, the difference between TGD - ISC and the delay used without ISC has a
+#: standard deviation of 0.24 m on L2C and 0.55 m on L5Q (`tests/gnss/test_group_delays.py`).
 _WITHOUT_ISC_M: Final[Mapping[str, float]] = {"2": 0.3, "5": 0.6}
 
 

@@ -25,19 +25,19 @@ class SourceSatellites(NamedTuple):
     """Satellites of a source, T epochs by K channels."""
 
     states: SatelliteStates  #: States at the times of transmission, with the source's corrections.
-    fast_m: Floats | None  #: Code corrections in addition to satellite clocks, shape (T, K).
+    fast_m: Floats | None  #: Corrections added to the codes besides satellite clocks, (T, K); None without SBAS.
     reason: Bits  #: Rejection reasons of satellites that the source does not correct, shape (T, K).
-    fixes: object = None  #: Corrections of the satellites, which `delays` of the same source uses.
+    fixes: object = None  #: Corrections of the satellites, passed on to `delays` of the source.
 
 
 @dataclass(frozen=True, kw_only=True)
 class BaseDifferences:
     """Corrections from a base station to the ranges of a train, T epochs by K channels."""
 
-    #: Corrections of codes and phases, shape (T, K); NaN if the station has no recent value.
+    #: Errors at the station, subtracted from codes and phases, shape (T, K); NaN if the station has no recent value.
     code_m: Floats
     phase_m: Floats
-    arc: Integers  #: Arc number of the station's phase, shape (T, K).
+    arc: Integers  #: Arc number of the station's phase, shape (T, K); -1 if the station has no recent phase.
     #: Sigma of the satellite and atmospheric errors that remain after the code correction, shape (T, K).
     sigma_m: Floats
 
@@ -46,12 +46,12 @@ class SourceDelays(NamedTuple):
     """Delays from a correction source and range error sigmas, T epochs by K channels."""
 
     delays: Delays  #: Delays that are subtracted from the codes.
-    sigma_m: Floats  #: Sigma used for the weights in addition to receiver noise, shape (T, K).
+    sigma_m: Floats  #: Sigma added in quadrature to receiver noise for the weights, shape (T, K).
     #: Sigma of satellite and atmospheric errors, and the part of it computed by `NominalErrors`; shape (T, K).
     nominal_m: Floats
     nominal_elevation_sigma_m: Floats
-    base: BaseDifferences | None = None  #: Subtracted base-station corrections.
-    floor: Literal["added", "included"] = "added"  #: Whether `sigma_m` includes the error floor of the codes.
+    base: BaseDifferences | None = None  #: Base-station corrections to be subtracted, or None.
+    floor: Literal["added", "included"] = "added"  #: "included": `sigma_m` contains the error floor of codes.
 
 
 class CorrectionSource(Protocol):
@@ -98,15 +98,15 @@ def choose_ionosphere(
 
 @dataclass(frozen=True, kw_only=True)
 class BroadcastSource:
-    """Source that uses delay models, and precise orbits and clocks if available, otherwise broadcast records."""
+    """Source that uses delay models and precise orbits and clocks; without precise data, broadcast records."""
 
     navigation: Navigation
-    klobuchar: Floats | None  #: Coefficients, shape (8,); None leaves the ionosphere uncorrected.
-    #: Additional sigma of the vertical delay if the coefficients were not received.
+    klobuchar: Floats | None  #: Coefficients, shape (8,); if None, ionospheric delays remain uncorrected.
+    #: Additional sigma of the vertical delay if typical coefficients are used; 0 if the coefficients were received.
     ionosphere_sigma_m: float = 0.0
     troposphere: Literal["saastamoinen", "off"] = "saastamoinen"
-    nominal: NominalErrors = field(default_factory=NominalErrors)  #: Assumed satellite and atmospheric errors.
-    notes: tuple[str, ...] = ()  #: Notes on data that replace requested data.
+    nominal: NominalErrors = field(default_factory=NominalErrors)  #: Assumed nominal errors.
+    notes: tuple[str, ...] = ()  #: Notes on requested data that had to be replaced.
     second: Literal["none", "optional", "required"] = "optional"
 
     @classmethod

@@ -1,4 +1,4 @@
-"""SBAS: readers and decoders of messages, and their corrections (RTCA DO-229D, appendix A)."""
+"""SBAS: readers and decoders of messages, and corrections computed from the messages (RTCA DO-229D, appendix A)."""
 
 import lazy_loader
 

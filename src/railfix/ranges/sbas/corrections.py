@@ -44,7 +44,7 @@ _SIGMA_UDRE: Final = np.sqrt(np.array([*UDRE_VARIANCE_M2, np.nan, np.nan, np.nan
 
 
 def best_prn(messages: SbasMessages, limits: SbasLimits | None = None) -> tuple[int, str]:
-    """Return the PRN with the most usable fast corrections (the smallest such PRN), and a note on the choice.
+    """Return the PRN with the most usable fast corrections (if equal, the smallest), and a note on the choice.
 
     The choice depends on all messages of a log, and must be made before positioning begins. For live messages, the PRN
     must therefore be specified.
@@ -67,7 +67,7 @@ class SbasCorrections:
 
     A message is used from its time of reception on (`SbasMessages.time`), never before. Results are independent of the
     other epochs and satellites of a call, and of messages received later. Messages of other PRNs than `prn` are left
-    out. `notes` are notes on the messages; they precede the notes on the corrections.
+    out. The attribute `notes` begins with the notes given as argument.
     """
 
     def __init__(
@@ -76,14 +76,14 @@ class SbasCorrections:
         self.prn, self.limits = prn, limits or SbasLimits()
         of_prn = messages.of(prn)
         never = np.datetime64("NaT", "ns")
-        #: Reception of the first and the last message of the GEO; NaT without messages.
+        #: Reception times of the GEO's first and last message; NaT without messages.
         self.span: tuple[np.datetime64, np.datetime64] = (
             (of_prn.time.min(), of_prn.time.max()) if len(of_prn) else (never, never)
         )
         self._tables = SatelliteTables(of_prn, self.limits)
         self._grid = GridTables(of_prn, self.limits, self._tables.stops)
         self._service = ServiceTable(of_prn, self.limits)
-        #: Numbers of unused corrections, by kind and reason.
+        #: How many corrections were not used, by kind and reason.
         self.unused: Mapping[str, int] = {
             kind: number for kind, number in sorted((self._tables.unused + self._grid.unused).items()) if number
         }
@@ -114,7 +114,7 @@ class SbasCorrections:
         notes = []
         zeros = int((messages.type == 0).sum())
         if zeros:
-            used = "read as type 2" if self.limits.type0 == "as_type2" else "each stopped the GEO for 60 s"
+            used = "read as type 2" if self.limits.type0 == "as_type2" else "after each, the GEO was not used for 60 s"
             notes.append(f"PRN {self.prn} sent {zeros} messages of type 0 (do not use for safety): {used}")
         notes += [f"PRN {self.prn}: {number} {kind}, not used" for kind, number in self.unused.items()]
         return notes
@@ -124,8 +124,8 @@ class SbasCorrections:
     ) -> SatelliteCorrections:
         """Return the fast and long-term corrections for T epochs and K satellites.
 
-        The state of satellites outside the mask is NOT_IN_MASK. A long-term correction is applied only if a record of
-        `navigation` has the issue of data of the correction; otherwise the last correction with another issue is tried.
+        The state of satellites outside the mask is NOT_IN_MASK. A long-term correction is applied only if `navigation`
+        has a record with its issue of data; otherwise the latest earlier correction with a different issue is tried.
         Without navigation data, the newest correction is applied unchecked.
         """
         number = np.array([_NUMBER_OF.get(str(name), -1) for name in satellite], dtype=np.int64)

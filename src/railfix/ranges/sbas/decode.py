@@ -1,4 +1,4 @@
-"""Decoders of SBAS messages by tables of bit fields (RTCA DO-229D, A.4.4), in SI units.
+"""Decoders of SBAS messages by tables of bit fields (RTCA DO-229D, A.4.4); decoded values are in SI units.
 
 Every decoder returns arrays by name, all with n rows; the array `row` has the index of the message from which each row
 was decoded.
@@ -16,10 +16,10 @@ from railfix.core.arrays import Bytes, Datetimes, Floats, Integers, Masks
 from railfix.core.timescale import SECONDS_PER_DAY, seconds, timedelta
 from railfix.ranges.sbas.messages import SbasMessages
 
-Decoded = dict[str, NDArray[Any]]  #: Decoded arrays by the name of the field.
-SLOTS: Final = 51  #: Largest number of satellites of a PRN mask; corrections refer to the slots 0 to 50 of the mask.
-BLOCK: Final = 13  #: Number of slots of one message of types 2 to 5.
-#: Largest number of regions of one message of type 27.
+Decoded = dict[str, NDArray[Any]]  #: Decoded arrays by field name.
+SLOTS: Final = 51  #: Largest number of satellites in a PRN mask; corrections refer to the slots 0 to 50 of the mask.
+BLOCK: Final = 13  #: Number of slots with corrections in one message of types 2 to 5.
+#: Largest number of regions in one message of type 27.
 _REGIONS: Final = 5
 _DO_NOT_USE_DELAY_M: Final = 0x1FF * 0.125
 #: Rows and columns of the elements above the diagonal of a covariance factor, in the order of the message.
@@ -27,11 +27,11 @@ _UPPER: Final = ([0, 0, 0, 1, 1, 2], [1, 2, 3, 2, 3, 3])
 
 
 class BitField(NamedTuple):
-    """Bit field of a message: one number, or `number` numbers that begin `step` bits apart (by default `length`)."""
+    """Bit field of a message: one number, or `number` numbers that begin `step` bits apart (`step` None: `length`)."""
 
     first: int
     length: int
-    #: Value of the least significant bit; None for an integer.
+    #: Value of the least significant bit; with None, the number is read as an integer.
     scale: float | None = None
     signed: bool = False
     number: int | None = None
@@ -43,7 +43,7 @@ def _read_signed(first: int, length: int, scale: float | None = None, number: in
     return BitField(first, length, scale, True, number)
 
 
-#: Fields of a message or of a part of a message; a sequence of fields becomes one array with a column per field.
+#: Fields of a message or of a part of a message; a sequence of bit fields becomes one array with a column per field.
 Layout = Mapping[str, BitField | Sequence[BitField]]
 
 #: Layouts of complete messages, by type, and of parts of messages. The bits of a part are counted from the beginning of
@@ -239,7 +239,7 @@ def _by_slot(row: Integers, first: Integers, fields: Decoded) -> Decoded:
 
 
 def _join(parts: Sequence[Decoded]) -> Decoded:
-    """Return the rows of several decoders in the order of the messages, without invalid slots."""
+    """Return the rows of all `parts` in the order of the messages, without invalid slots."""
     joined = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     kept = np.flatnonzero((joined["slot"] >= 0) & (joined["slot"] < SLOTS))
     order = kept[np.argsort(joined["row"][kept], kind="stable")]
@@ -304,7 +304,7 @@ def covariance(messages: SbasMessages) -> Decoded:
 
 
 def service(messages: SbasMessages) -> Decoded:
-    """Return the fields of type 27, with message numbers from 1; the corners of regions have shape (n, 5)."""
+    """Return the fields of type 27; messages of a set are numbered from 1, and corners of regions have shape (n, 5)."""
     decoded = decode(messages, 27)
     return {
         **decoded,

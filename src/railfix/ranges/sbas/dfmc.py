@@ -6,19 +6,19 @@ ionosphere-free ranges. For L1 C/A and L5, and for E1 and E5a, the clock correct
 from ranges of B1C and B2a, the group delays of B-CNAV1 must be subtracted. GLONASS has slots in the mask, but its
 corrections are for the signals L1OC and L3OC, which are not read.
 
-The standard was not available. Message layouts are taken from cssrlib (sbas.py), the least values of sigma and the
-degradation from MAAST (L5_decodeMT37.m, L5_decode_satcorr.m, after ED-259A), and the slots of the mask from cssrlib,
-MAAST and Wireshark (packet-sbas_l5.c). An hour of messages of SouthPAN and BDSBAS (`test_sbas_dfmc.py`) shows that the
-slot has 8 bits and the fraction of the rate 4 bits, as in cssrlib, and that the issue of data for BeiDou is the IODE of
-B-CNAV1. BDSBAS corrects the clocks of BeiDou-3 by decimetres. Since group delays differ by metres, these corrections do
-not include group delays.
+The text of these standards was not available. Message layouts are taken from cssrlib (sbas.py), the least values of
+sigma and the degradation from MAAST (L5_decodeMT37.m, L5_decode_satcorr.m, after ED-259A), and the slots of the mask
+from cssrlib, MAAST and Wireshark (packet-sbas_l5.c). An hour of messages of SouthPAN and BDSBAS (`test_sbas_dfmc.py`)
+shows that the slot number has 8 bits and `rate_share` 4 bits, as in cssrlib, and that the issue of data for BeiDou is
+the IODE of B-CNAV1. BDSBAS corrects the clocks of BeiDou-3 by decimetres. Group delays differ by metres; these
+corrections can therefore not include group delays.
 
-The orbits of SBAS satellites (ephemerides in types 39 and 40, almanacs in type 47) are used for a note only. Layouts
-and scales of these messages are the same in cssrlib and MAAST (L5_decodeMT39.m, 40, 47). SouthPAN messages of three
-days (`test_sbas_orbits.py`) determine two other conventions: the semi-major axis is counted from 6370 km, and the node
-from the meridian of Greenwich at midnight of GPS time. It is not known whether a step of the inclination rate is 7 pi /
-6 or 7 pi times 2^-21 1e-6 rad/s; SouthPAN sends 0, and no position is computed for an orbit with another rate. Orbits
-of BDSBAS have a different layout and are left out.
+The orbits of SBAS satellites (ephemerides in types 39 and 40, almanacs in type 47) are used only for a note in the log.
+Layouts and scales of these messages are the same in cssrlib and MAAST (L5_decodeMT39.m, 40, 47). SouthPAN messages of
+three days (`test_sbas_orbits.py`) determine two other conventions: the semi-major axis is counted from 6370 km, and the
+node from the meridian of Greenwich at midnight of GPS time. It is not known whether a step of the inclination rate is
+(7 pi / 6) 2^-21 1e-6 rad/s or 7 pi 2^-21 1e-6 rad/s; SouthPAN sends 0, and no position is computed for an orbit whose
+rate is not 0. Orbits of BDSBAS have a different layout and are left out.
 """
 
 from __future__ import annotations
@@ -41,20 +41,20 @@ from railfix.ranges.sbas.decode import BitField, Decoded, Layout, covariance_fac
 from railfix.ranges.sbas.messages import SbasMessages
 from railfix.ranges.sbas.standard import first_that_holds, system_name
 
-AUGMENTED: Final = 92  #: Largest number of satellites of a mask.
-FIRST: Final = 53  #: Number of satellites in type 35; the others are in type 36.
-DO_NOT_USE: Final = 15  #: Indicator of "do not use", without a sigma; unmonitored satellites are absent from type 32.
-#: Least sigma by indicator 0 to 14 [m].
+AUGMENTED: Final = 92  #: Largest number of satellites in a mask.
+FIRST: Final = 53  #: Number of satellites with indicators in type 35; type 36 has the rest.
+DO_NOT_USE: Final = 15  #: Indicator for "do not use"; type 32 has no satellites that are not monitored.
+#: Sigma [m] for each indicator from 0 to 14 if the scale of type 37 is 0.
 SIGMA_LEAST_M: Final = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, 2.5, 3.0, 4.0, 10.0)
-#: Step of the sigma by indicator 0 to 14, which is multiplied by the scale of type 37 [m].
+#: For each indicator from 0 to 14, this step [m], multiplied by the scale of type 37, is added to `SIGMA_LEAST_M`.
 SIGMA_STEP_M: Final = (0.0625, 0.125, 0.125, 0.125, 0.125, 0.25, 0.25, 0.25, 0.25, 0.25, 0.5, 0.5, 1.0, 3.0, 6.0)
-_ONE_MORE: Final = -2  #: Placeholder for an indicator that type 34 increases by one.
+_ONE_MORE: Final = -2  #: Placeholder for an indicator that a message of type 34 increases by one.
 _DEGRADED: Final = ("G", "R", "E", "C", "S", "")  #: Constellations in the order of type 37.
-#: Validity of a mask (`MASK_S`) and of an indicator (`INDICATOR_S`), and time for which a message of type 0 stops the
-#: use of the SBAS satellite (`STOP_S`) [s].
+#: Time-outs of a mask (`MASK_S`) and of an indicator (`INDICATOR_S`) [s]; after a message of type 0, the SBAS satellite
+#: is not used for `STOP_S` [s].
 MASK_S, INDICATOR_S, STOP_S = 600.0, 12.0, 60.0
 
-#: Time, covariance and indicator, which have equal bit positions in types 32 and 40.
+#: Time, covariance and indicator; each field has the same bit position in types 32 and 40.
 _COVARIANCE: Final[Layout] = {
     "time_of_day_s": BitField(106, 13, 16.0),
     "exponent": BitField(119, 3, 1.0),
@@ -95,14 +95,14 @@ class DfmcState(IntEnum):
     """State of a satellite's correction: in force (OK), or the reason why no correction is in force."""
 
     OK = 0
-    STOPPED = 1  #: Type 0 was received: the service must not be used.
+    STOPPED = 1  #: Type 0 was received within the last 60 s.
     NO_MASK = 2
     NOT_IN_MASK = 3
     NO_CORRECTION = 4
     TIMED_OUT = 5
     DO_NOT_USE = 6  #: Indicator 15.
     NO_DEGRADATION = 7  #: Type 37 is missing: neither scale nor time-outs are known.
-    NO_RECORD = 8  #: No navigation record has the issue of data of the correction.
+    NO_RECORD = 8  #: No navigation record has the correction's issue of data.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,15 +110,15 @@ class DfmcCorrections:
     """Corrections by SBAS on L5 for T epochs by K satellites."""
 
     state: Integers  #: `DfmcState`, shape (T, K).
-    #: Issue of data of the record to which the correction refers; -1 without a correction; shape (T, K).
+    #: Issue of data of the navigation record to which the correction refers; -1 without a correction; shape (T, K).
     issue: Integers
     record: Integers  #: Row of `navigation.kepler` with this issue, -1 without such a record; shape (T, K).
-    position_m: Floats  #: Correction added to the broadcast position, shape (T, K, 3).
-    clock_m: Floats  #: Correction added to c times the broadcast clock, without group delays; shape (T, K).
-    sigma_m: Floats  #: Sigma from the indicator and the scale, before covariance and degradation; shape (T, K).
+    position_m: Floats  #: Correction to be added to the broadcast position, shape (T, K, 3).
+    clock_m: Floats  #: Correction to be added to c times the broadcast clock; excludes group delays; shape (T, K).
+    sigma_m: Floats  #: Sigma from indicator and scale; covariance and degradation not yet applied; shape (T, K).
     factor: Floats  #: Upper triangular factor of the covariance, shape (T, K, 4, 4).
     growth_m: Floats  #: Degradation of the correction since its reception, shape (T, K).
-    #: Constant added to the sigma factor computed from the covariance, shape (T, K).
+    #: Constant to be added to the factor on sigma that is computed from the covariance, shape (T, K).
     constant: Floats
 
     def sigma_along_m(self, line_of_sight: Floats) -> Floats:
@@ -157,13 +157,13 @@ def _newest(sent: Datetimes, time: Datetimes) -> tuple[Integers, Floats]:
 class DfmcService:
     """Corrections for any epochs from the L5 messages of one SBAS satellite; a message is used from its reception on.
 
-    Messages of other PRNs are left out. `notes` are notes on the messages; they precede the notes on the corrections.
+    Messages of other PRNs are left out. The attribute `notes` begins with the notes given as argument.
     """
 
     def __init__(self, messages: SbasMessages, *, prn: int, notes: tuple[str, ...] = ()) -> None:
         own, never = messages.of(prn), np.datetime64("NaT", "ns")
         self.prn = prn
-        #: Reception of the first and the last message; NaT without messages.
+        #: Reception times of the first and the last message; NaT without messages.
         self.span: tuple[np.datetime64, np.datetime64] = (own.time[0], own.time[-1]) if len(own) else (never, never)
         self.notes = (
             *notes,
@@ -186,12 +186,12 @@ class DfmcService:
         if prn == "best":
             numbers, count = np.unique(messages.prn[messages.type == 32], return_counts=True)
             prn = int(numbers[np.argmax(count)]) if len(numbers) else messages.prns[0]
-            choice = f"best SBAS PRN by corrections on L5: {prn} (the log has {', '.join(map(str, messages.prns))})"
+            choice = f"SBAS PRN with most corrections on L5: {prn} (of {', '.join(map(str, messages.prns))})"
         else:
             choice = messages.describe_choice(prn)
         notes = (*messages.notes, choice)
         if zeros := int(np.sum(messages.of(prn).type == 0)):
-            notes += (f"PRN {prn} sent {zeros} messages of type 0 (do not use for safety): each stopped SBAS for 60 s",)
+            notes += (f"PRN {prn} sent {zeros} messages of type 0 (do not use for safety): unused for 60 s after each",)
         return cls(messages, prn=prn, notes=notes)
 
     def satellites(self, time: Datetimes, satellite: Strings, navigation: Navigation | None = None) -> DfmcCorrections:
@@ -327,7 +327,7 @@ class DfmcService:
         return result
 
 
-_BDSBAS: Final = 5  #: Provider number of BDSBAS.
+_BDSBAS: Final = 5  #: Number of the SBAS provider BDSBAS.
 _ANGLE: Final = np.pi * 2.0**-33
 _AXIS_M: Final = 6_370_000.0
 _BEFORE_FIRST_PRN: Final = 119
@@ -364,7 +364,7 @@ _ORBIT_LAYOUTS: Final[Mapping[int, Layout]] = {
         "time_of_day_s": BitField(100, 6, 1800.0),
     },
 }
-_ALMANACS_AT: Final = (10, 116)  #: First bits of the two satellites of type 47.
+_ALMANACS_AT: Final = (10, 116)  #: Message type 47 has two satellites; first bit of each.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -372,8 +372,8 @@ class SbasOrbits:
     """Orbits of SBAS satellites, n rows."""
 
     row: Integers  #: Row of the last message of each orbit, shape (n,).
-    prn: Integers  #: PRN of each satellite, shape (n,).
-    provider: Integers  #: Provider number of the service, 8 for SouthPAN; shape (n,).
+    prn: Integers  #: PRN of the satellite, shape (n,).
+    provider: Integers  #: Number of the SBAS provider, 8 for SouthPAN; shape (n,).
     reference: Datetimes  #: Reference time of each orbit, shape (n,).
     orbits: Orbits
     usable: Masks  #: True where the inclination rate is 0, so that a position can be computed, shape (n,).
@@ -389,14 +389,14 @@ class SbasOrbits:
         """Return a note on the last orbit that has a position; an empty tuple if there is none."""
         last = zip(self.prn[self.usable][-1:], self.position_ecef_m(self.reference)[self.usable][-1:], strict=True)
         return tuple(
-            f"PRN {prn} is, by its own messages, at {float(geodetic_from_ecef(place)[1]):.1f} degrees east, "
+            f"according to its own messages, PRN {prn} is at {float(geodetic_from_ecef(place)[1]):.1f} degrees east, "
             f"{np.linalg.norm(place) / 1e3:,.0f} km from the centre of the Earth; its ranges are not used"
             for prn, place in last
         )
 
 
 def ephemerides(messages: SbasMessages, valid_s: float) -> SbasOrbits:
-    """Return the ephemerides of one SBAS satellite, from types 39 and 40 of one issue at most `valid_s` apart."""
+    """Return a satellite's ephemerides, each from types 39 and 40 with equal issue, received within `valid_s`."""
     rows = {kind: np.flatnonzero(messages.type == kind) for kind in (39, 40)}
     sent = {kind: read_fields(messages.bits[at], _ORBIT_LAYOUTS[kind]) for kind, at in rows.items()}
     newest: dict[tuple[int, int], int] = {}

@@ -34,7 +34,7 @@ _RTKLIB: Final = re.compile(r"(\d+)\s+(\d+(?:\.\d*)?)\s+(\d+)\s+(\d+)\s*:\s*([0-
 _EMS: Final = re.compile(r"(\d+)((?:\s+\d+){5})\s+(\d+(?:\.\d*)?)\s+(\d+)\s+([0-9A-Fa-f]+)")
 _RINEX_HEAD: Final = re.compile(r"(\d{1,3})((?:\s+\d+){5})\s+(\d+(?:\.\d*)?)(?:\s+([A-Z]\d)\s+(\d+)\b.*)?")
 _RINEX_BYTES: Final = 18
-#: RINEX type B states the time of a message's first bit; the message is complete this much later [s].
+#: RINEX type B states the time of a message's first bit; the message is complete this time later [s].
 _RINEX_SHIFT_S: Final = 1.0
 
 
@@ -68,7 +68,7 @@ def kind_of_file(path: str, lines: Sequence[str]) -> str:
             return "ems"
         raise InputFileError(
             path,
-            f"{line[:40]!r} does not begin an SBAS file; '1481 108093 129 26 : 5369C4...' (RTKLIB), "
+            f"{line[:40]!r} is not the first line of an SBAS file; '1481 108093 129 26 : 5369C4...' (RTKLIB), "
             "'120 08 05 26 06 01 33 26 5369C4...' (EMS) or a RINEX header of type B was expected",
             line=number,
         )
@@ -168,15 +168,13 @@ def _check_line(path: str, raw: RawMessage, band: Band) -> RawMessage | InputFil
         digits = f"{int(raw.digits, 2) << 6:064X}"
         return RawMessage(raw.line, raw.time_ns, raw.prn, raw.kind, digits)
     if len(raw.digits) not in (58, 63, 64):
-        what = (
-            f"the message has {len(raw.digits)} hexadecimal digits, 58 (226 bits) or 63 or 64 (250 bits) were expected"
-        )
+        what = f"the message has {len(raw.digits)} hexadecimal digits; expected 58 (226 bits), or 63 or 64 (250 bits)"
         return InputFileError(path, what, line=raw.line)
     kind = (int(raw.digits[:4], 16) >> (2 if band == "L1" else 6)) & 0x3F
     if raw.kind not in (-1, kind):
         return InputFileError(
             path,
-            f"the stated message type is {raw.kind}, the type in the message on {band} is {kind} (setting sbas_band)",
+            f"the stated message type is {raw.kind}, but the message on {band} has type {kind} (setting sbas_band)",
             line=raw.line,
         )
     return raw
@@ -193,7 +191,7 @@ def _instant(date: str, second: str) -> int:
     return int((start - GPS_EPOCH).astype(np.int64)) + round(value * 1e9)
 
 
-#: Number of hexadecimal digits of a message that is cut after its 226 data bits; 6 bits of parity or zeros follow.
+#: Number of hexadecimal digits of a truncated message: 226 data bits, then 6 bits of parity or zeros.
 _SHORT: Final = 58
 
 
@@ -227,8 +225,8 @@ def read_sbas(
     Returns
     -------
     SbasMessages
-        Messages in the order of reception. Times in RTKLIB and EMS files are assumed to be the ends of messages. Times
-        in RINEX refer to the first bit and are increased by 1 s.
+        Messages in the order of reception. Times in RTKLIB and EMS files are assumed to refer to the ends of the
+        messages. Times in RINEX refer to the first bit and are increased by 1 s.
 
     Raises
     ------
@@ -246,7 +244,7 @@ def read_sbas(
     log = _check(gathered, sources, band)
     if not len(log):
         counts = ", ".join(f"{number} by {reason}" for reason, number in sorted(log.rejected.items()))
-        raise InputFileError(", ".join(sources), f"has no SBAS message of {band} left: rejected {counts}")
+        raise InputFileError(", ".join(sources), f"has no valid SBAS message of {band}; rejected: {counts}")
     return log
 
 
@@ -330,9 +328,9 @@ def _check(gathered: _Gathered, sources: tuple[str, ...], band: Band) -> SbasMes
 
 
 def _read_bits(digits: NDArray[np.int_], source: Integers, bits: Bytes) -> Integers:
-    """Return the number of parity bits of each message: 24 in complete messages, 6 or 0 in cut messages.
+    """Return the number of parity bits of each message: 24 in complete messages, 6 or 0 in truncated messages.
 
-    A cut message ends with 6 bits that RTKLIB sets to zero and other programs leave as received. In files of other
+    A truncated message ends with 6 bits that RTKLIB sets to zero and other programs keep as received. In files of other
     programs, these bits equal the first bits of the parity in most messages; by chance alone, they would be equal in
     only 1 of 64 messages.
     """

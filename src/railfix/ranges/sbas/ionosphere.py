@@ -24,9 +24,9 @@ Answer = TypeVar("Answer", bound=np.generic)
 BANDS: Final = 11  #: Number of bands of the ionospheric grid.
 BITS: Final = 201  #: Number of bits of the mask of a band.
 BLOCK: Final = 15  #: Number of grid points in one message of type 26.
-#: Number of columns of the 5-degree raster on which grid points are numbered, from 180 west.
+#: Number of columns of the 5-degree raster on which grid points are numbered, starting at 180 degrees west.
 COLUMNS: Final = 72
-ROWS: Final = 37  #: Number of rows of this raster, from 90 south.
+ROWS: Final = 37  #: Number of rows of the 5-degree raster, starting at 90 degrees south.
 
 _SHORT: Final = tuple(range(-55, 60, 5))
 _LONG: Final = (-75, -65, *_SHORT, 65, 75)
@@ -80,8 +80,8 @@ POINT_OF_BIT, CELLS_OF_POINT = _layout()
 class GridTables:
     """Grid masks and delays by point and time, and the time spans in which masks and delays are constant.
 
-    `delays` has for each grid point the vertical `delay_m` (NaN for "do not use"), `givei`, and the mask's `issue`
-    (4 band + IODI). `unused` counts the delays for which no mask of the same issue was known.
+    For each grid point, `delays` has the vertical `delay_m` (NaN for "do not use"), `givei`, and the `issue` of the
+    mask (4 * band + IODI). `unused` counts the delays for which no mask of the same issue was known.
     """
 
     def __init__(self, messages: SbasMessages, limits: SbasLimits, stops: Stops) -> None:
@@ -119,12 +119,12 @@ class GridTables:
         return Series.of(point.ravel(), np.repeat(time, BLOCK), {**columns, "issue": np.repeat(issue, BLOCK)})
 
     def mask_active(self, issue: Integers, time: Datetimes) -> Masks:
-        """Return whether the mask of a band and issue (4 band + IODI) is known and not timed out."""
+        """Return whether the mask of a band and issue (4 * band + IODI) is known and has not timed out."""
         row = self._by_issue.newest(issue, time)
         return self._by_issue.in_force(row, time, self._stops.last(time), self._mask_limit)
 
     def in_mask(self, point: Integers, time: Datetimes) -> Masks:
-        """Return True for points in the newest mask of at least one of their bands, if this mask has not timed out."""
+        """Return True for points that are in the newest mask of one of their bands, provided that it is in force."""
         inside, stop = np.zeros(np.broadcast_shapes(point.shape, time.shape), dtype=bool), self._stops.last(time)
         for cell in np.moveaxis(CELLS_OF_POINT[point], -1, 0):
             row = self._by_cell.newest(cell, time)
@@ -133,7 +133,7 @@ class GridTables:
 
 
 class Spans:
-    """Spans between times of reception and time-outs of messages, in which no value of the grid changes."""
+    """Time spans in which no value of the grid changes; each ends at the next reception or time-out of a message."""
 
     def __init__(self, time: Datetimes, timeouts_s: Sequence[float]) -> None:
         ends = [time, *(time + timedelta(np.asarray(float(seconds))) for seconds in timeouts_s)]
@@ -146,14 +146,14 @@ class Spans:
 
 
 def distinct_lookups(span: Integers, point: Integers, points: int) -> tuple[Indices, Indices]:
-    """Return the first row of each distinct pair of span (M,) and points (M, 4), and the number of each row's pair.
+    """Group rows with equal span (M,) and points (M, 4); return the first row of each group, and each row's group.
 
     The number of a point is at least -1 and less than `points`.
     """
-    # Successive rows of one span have one number; a span that occurs again later may have another number.
+    # Successive rows of a span share a number; if the span occurs again later, it may get a different number.
     key = np.cumsum(np.r_[False, span[1:] != span[:-1]])[: len(span)].astype(np.int64)
     pairs = (point[:, ::2] + 1) * (points + 1) + point[:, 1::2] + 1
-    # The keys are renumbered after the first two points, so that they stay small for logs of any length.
+    # After two of the four points are encoded, keys are renumbered, so that they stay small for logs of any length.
     _, key = np.unique(key * (points + 1) ** 2 + pairs[:, 0], return_inverse=True)
     _, first, which = np.unique(key * (points + 1) ** 2 + pairs[:, 1], return_index=True, return_inverse=True)
     return first, which
@@ -241,7 +241,7 @@ def _cells(latitude: Floats, longitude: Floats) -> Iterator[Callable[[Indices], 
 def _choose(
     grid: GridTables, time: Datetimes, span: Integers, latitude: Floats, longitude: Floats
 ) -> tuple[Integers, Floats, Floats]:
-    """Return cell corners (M, 4) below 75 deg latitude, -1 if unused, and coordinates x and y in cells (M,)."""
+    """Return cell corners (M, 4) below 75 deg latitude, -1 if unused, and the relative positions x, y in cells (M,)."""
     point = np.full((len(latitude), 4), _NO_POINT, dtype=np.int64)
     x, y = np.zeros((2, len(latitude)))
     open_ = np.isfinite(latitude) & (np.abs(latitude) < _POLAR_DEG)
@@ -270,7 +270,7 @@ def _choose(
 
 
 def _choose_polar(grid: GridTables, time: Datetimes, latitude: Floats, longitude: Floats) -> tuple[Integers, Floats]:
-    """Return points and weights (M, 4) from 75 degrees on; -1 and NaN if one of the four points is not in the mask."""
+    """Return points and weights (M, 4) beyond 75 deg latitude; -1 and NaN if one of four points is not in the mask."""
     north = latitude >= 0.0
     sign = np.where(north, 1.0, -1.0)
     west = np.floor(longitude / 10.0) * 10.0

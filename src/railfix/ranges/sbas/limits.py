@@ -8,7 +8,7 @@ from pydantic import Field
 
 from railfix.core.settings import Settings
 
-#: Time-outs after reception [s]: the first for precision approach, the second for en route to non-precision approach
+#: Time-outs after reception [s]: first for precision approach, then for phases from en route to non-precision approach
 #: (DO-229D, table A-25). Time-outs of fast corrections are in `FAST_TIMEOUT_S`.
 TIMEOUT_S: Final[dict[str, tuple[float, float]]] = {
     "mask": (600.0, 600.0),
@@ -26,14 +26,14 @@ TIMEOUT_S: Final[dict[str, tuple[float, float]]] = {
 class SbasLimits(Settings):
     """Settings of the use of SBAS messages."""
 
-    #: Time-outs of precision approach (shorter), or of en route to non-precision approach.
+    #: Time-outs for precision approach (shorter), or for the phases from en route to non-precision approach.
     mode: Literal["precision", "en_route"] = "precision"
-    type0: Literal["stop", "as_type2"] = "stop"  #: Type 0 stops the use of the GEO for 60 s, or is read as type 2.
-    range_rate: Literal["mops", "off"] = "mops"  #: Range-rate part of fast corrections (DO-229D, A.4.4.3), or none.
+    type0: Literal["stop", "as_type2"] = "stop"  #: After type 0, the GEO is not used for 60 s ("stop").
+    range_rate: Literal["mops", "off"] = "mops"  #: "off" omits range rates (DO-229D, A.4.4.3).
     #: Satellites without degradation data are rejected, or used with the shortest time-out and a sigma increased by 8 m
     #: (DO-229D, J.2.2).
     incomplete: Literal["reject", "inflate"] = "reject"
-    #: Largest UDREI used; with None, 11 for precision approach and 13 for en route.
+    #: Satellites with a larger UDREI are rejected; None means 11 in mode "precision" and 13 in mode "en_route".
     max_udrei: int | None = Field(default=None, ge=0, le=13)
     #: Time from the first bit of a message to the end of reception.
     message_s: float = Field(default=1.0, ge=0.0, le=2.0)

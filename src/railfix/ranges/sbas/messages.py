@@ -13,13 +13,13 @@ from railfix.core.arrays import Bytes, Datetimes, Integers, Masks, RowArrays, fr
 from railfix.core.checksums import crc24q
 from railfix.core.notebook import NotebookTable
 
-Band = Literal["L1", "L5"]  #: Frequency of the messages, and of the corrections.
-#: Preambles of successive messages: three alternating patterns of eight bits (DO-229D, A.4.3.1); on L5 six patterns of
-#: four bits.
+Band = Literal["L1", "L5"]  #: Frequency band on which messages are sent.
+#: Preambles of successive messages: on L1 three patterns of eight bits in turn (DO-229D, A.4.3.1), on L5 six patterns
+#: of four bits.
 PREAMBLES: Final[dict[Band, tuple[int, ...]]] = {"L1": (0x53, 0x9A, 0xC6), "L5": (0x5, 0xC, 0x6, 0x9, 0x3, 0xA)}
-DATA_BITS: Final = 226  #: Number of bits of preamble, type and data of a message.
-ROW_BYTES: Final = 32  #: Number of bytes of a message in `SbasMessages.bits`.
-#: A message that occurs twice within this time counts as forwarded by two receivers.
+DATA_BITS: Final = 226  #: Number of bits of a message without parity: preamble, type and data.
+ROW_BYTES: Final = 32  #: Number of bytes for a message in `SbasMessages.bits`.
+#: A message that occurs again within this time is a duplicate, forwarded by a second receiver.
 _REPEATED_WITHIN: Final = np.timedelta64(1, "s")
 
 
@@ -81,7 +81,7 @@ class SbasMessages(RowArrays, NotebookTable):
     parity_bits: Integers
     source: Integers  #: Index in `sources`, shape (N,).
     line: Integers  #: 1-based line of the file, shape (N,).
-    sources: tuple[str, ...] = ()  #: Names of the files.
+    sources: tuple[str, ...] = ()  #: Names of the files or receivers.
     #: Number of messages left out, by reason: "parity", "preamble", "line", "duplicate".
     rejected: Mapping[str, int] = field(default_factory=dict)
     notes: tuple[str, ...] = ()  #: Warnings about the messages, one sentence each.

@@ -18,7 +18,7 @@ from railfix.ranges.sbas.messages import SbasMessages
 from railfix.ranges.sbas.standard import FAST_DEGRADATION_MPS2, FAST_TIMEOUT_S, SERVICE_FACTOR
 from railfix.ranges.sbas.tables import ALARM, SatelliteTables, Series
 
-#: A range rate is applied for at most this multiple of the time between the two fast corrections that determine it.
+#: A range rate is applied for at most this multiple of the time between the two corrections that determine the rate.
 _RATE_REACH: Final = 8.0
 _ACCELERATION: Final = np.array(FAST_DEGRADATION_MPS2)
 _FACTOR: Final = np.array(SERVICE_FACTOR)
@@ -30,17 +30,17 @@ class FastInForce:
 
     missing: Masks  #: True where no fast correction was received.
     timed_out: Masks  #: True where the correction is too old, or the mask is not active.
-    no_factor: Masks  #: True where type 7 is missing.
-    no_rate: Masks  #: True where a required range rate is missing.
+    no_factor: Masks  #: True where no type 7 is in force.
+    no_rate: Masks  #: True where a range rate is required but unknown.
     udrei: Integers  #: UDREI, -1 if it was not received.
     correction_m: Floats
     rate_mps: Floats
-    growth_m: Floats  #: Degradation by the age of the correction (A.4.5.1.1).
-    #: Degradation of the range rate per second; 0 where the rate does not degrade (A.4.5.1.2).
+    growth_m: Floats  #: Degradation due to the age of the correction (A.4.5.1.1).
+    #: Growth per second of the range-rate degradation; 0 where the rate does not degrade (A.4.5.1.2).
     rate_growth_mps: Floats
     #: Time between the two fast corrections that determine the range rate; infinite where the rate does not degrade.
     rate_span_s: Floats
-    since_s: Floats  #: Time since the time of applicability of the correction.
+    since_s: Floats  #: Time since the applicability of the correction.
     aged: Masks  #: True where the correction is older than the time-out of precision approach.
 
 
@@ -104,11 +104,11 @@ def _rate(
     reach_s: Floats,
     since_s: Floats,
 ) -> tuple[Floats, Floats, Floats, Masks]:
-    """Return the range rate, the degradation of the rate per second, the time between the two corrections used, and a
-    mask of missing rates.
+    """Return the range rate, the growth per second of the rate's degradation, the time between the two corrections
+    used, and a mask of missing rates.
 
-    The rate is computed from the newest and the previous correction. After an alarm (IODF 3), the correction nearest to
-    half the time-out before the newest is used in place of the previous correction.
+    The rate is computed from the newest and the previous correction. After an alarm (IODF 3), the previous correction
+    is replaced by the earlier correction whose age, relative to the newest, is nearest to half the time-out.
     """
     zero = np.zeros(row.shape)
     if limits.range_rate == "off":
@@ -147,11 +147,11 @@ def _nearest(fast: Series, row: Integers, before: NDArray[np.timedelta64]) -> In
 class LongTermInForce:
     """Long-term corrections in force; all arrays have shape (T, K)."""
 
-    row: Integers  #: Row of `SatelliteTables.long_term`, -1 for none.
-    record: Integers  #: Row of the navigation record, -1 for none.
+    row: Integers  #: Row of `SatelliteTables.long_term`, -1 without a correction.
+    record: Integers  #: Row of the navigation record, -1 without a record.
     missing: Masks  #: True where a required correction was not received.
     timed_out: Masks  #: True where the correction is too old, or the mask is not active.
-    mismatch: Masks  #: True where no record has the issue of data of the correction.
+    mismatch: Masks  #: True where no navigation record has the correction's issue of data.
 
 
 def long_term_in_force(
@@ -201,7 +201,7 @@ def long_term_in_force(
 def covariance_in_force(
     tables: SatelliteTables, limits: SbasLimits, time: Datetimes, number: Integers, stop: Datetimes
 ) -> tuple[Integers, Masks]:
-    """Return the row of the covariance in force, and a mask of satellites without one while the GEO sends type 28."""
+    """Return the row of the covariance in force, and a mask of satellites without it although the GEO sends type 28."""
     table, limit, sent_at = tables.covariance, limits.timeout_s("covariance"), tables.covariance_time
     row = table.newest(number[None, :], time[:, None])
     if not len(sent_at):
@@ -259,7 +259,7 @@ def growth(
 def _long_term_growth(
     tables: SatelliteTables, limits: SbasLimits, time: Datetimes, long_row: Integers, row: Integers
 ) -> tuple[Floats, Masks]:
-    """Return the long-term degradation (A.4.5.1.3), and a mask of corrections older than the precision time-out."""
+    """Return the long-term degradation (A.4.5.1.3), and a mask of corrections too old for precision approach."""
     table, ten = tables.long_term, tables.degradation
     there = long_row >= 0
     since_reference = seconds(time - table["reference"][long_row])
@@ -295,10 +295,10 @@ class ServiceTable:
         self._reject = limits.incomplete == "reject"
 
     def factor(self, time: Datetimes, latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Masks]:
-        """Return the sigma UDRE factor at positions (NaN without type 27), and a mask of incomplete sets, each (T,).
+        """Return the sigma UDRE factor (T,) at positions (NaN without type 27), and a mask (T,) of incomplete sets.
 
         The newest complete set of one issue is used. Inside several regions the factor of the highest priority applies,
-        or the smallest factor among equal priorities. Outside all regions, the outside factor of the message applies.
+        or the smallest factor among equal priorities. Outside all regions, the factor stated for the outside applies.
         """
         factor, incomplete = np.full(len(time), np.nan), np.zeros(len(time), dtype=bool)
         newest = np.searchsorted(self.time, time, side="right") - 1
@@ -337,7 +337,7 @@ class ServiceTable:
 
 
 def _inside(values: Decoded, row: int, region: int, latitude_deg: Floats, longitude_deg: Floats) -> Masks:
-    """Return True for positions in a region: a rectangle, or its half that contains (latitude 1, longitude 2)."""
+    """Return True in a region: a rectangle, or the half of a rectangle with the corner (latitude 1, longitude 2)."""
     north, west, south, east = (
         values[name][row, region] for name in ("latitude_1_deg", "longitude_1_deg", "latitude_2_deg", "longitude_2_deg")
     )

@@ -36,7 +36,7 @@ class SbasSource:
     def satellites(
         self, time: Datetimes, channels: Channels, code_m: Floats, *, max_age_s: float | None = None
     ) -> SourceSatellites:
-        """Return satellites with long-term and fast corrections, from the records to which the corrections refer."""
+        """Return corrected satellites, computed from the records to which the long-term corrections refer."""
         fixes = self.corrections.satellites(time, channels.satellite, self.navigation)
         states = satellite_states(
             time, channels.satellite, channels.signal, code_m, self.navigation, max_age_s=max_age_s,
@@ -87,7 +87,7 @@ class DfmcSource:
         return SourceDelays(delays, delays.sigma_m, delays.sigma_m, np.zeros(delays.sigma_m.shape))
 
 
-SBAS_SIGNAL: Final = "1C"  #: Signal to which the corrections refer: GPS L1 C/A, in RINEX 3 notation.
+SBAS_SIGNAL: Final = "1C"  #: RINEX 3 code of the signal that is corrected: GPS L1 C/A.
 
 _REASON_OF: Final = {
     **dict.fromkeys(SatelliteState, Reason.SBAS_NO_CORRECTION),
@@ -126,7 +126,7 @@ def apply_dfmc(
 
 
 def dfmc_delays(fixes: DfmcCorrections, time: Datetimes, seen: SeenFrom, modelled: Delays) -> Delays:
-    """Return DO-229D tropospheric and modelled ionospheric delays, with the sigma of corrected ionosphere-free codes.
+    """Return tropospheric (DO-229D) and modelled ionospheric delays, and the sigma of corrected ionosphere-free codes.
 
     ``sigma^2 = sigma_corrections^2 + sigma_ionosphere^2 + sigma_troposphere^2`` (ED-259A), without receiver noise. The
     modelled ionospheric delay cancels in ionosphere-free codes.
@@ -153,7 +153,7 @@ def apply_long_term(states: SatelliteStates, fixes: SatelliteCorrections) -> tup
 def sbas_delays(
     sbas: SbasCorrections, fixes: SatelliteCorrections, time: Datetimes, seen: SeenFrom, frequency_hz: Floats
 ) -> Delays:
-    """Return SBAS grid and DO-229D tropospheric delays, and range sigmas; NaN for uncorrected satellites."""
+    """Return delays from the ionospheric grid and DO-229D's troposphere, and range sigmas; NaN if uncorrected."""
     shape = fixes.state.shape
     ionosphere, troposphere, sigma = np.full((3, *shape), np.nan)
     reason = np.zeros(shape, dtype=np.int64)

@@ -34,11 +34,11 @@ class SbasState:
         state = state.drop_before(time[-1])  # what later epochs need
     """
 
-    prn: int  #: PRN of the GEO, set in advance, because the best PRN is known only after all messages.
+    prn: int  #: PRN of the GEO, set in advance, because the best PRN is known only at the end of a log.
     limits: SbasLimits = field(default_factory=SbasLimits)
     #: Messages of this PRN, in the order of reception.
     messages: SbasMessages = field(default_factory=SbasMessages.none)
-    band: Band = "L1"  #: Frequency of the messages.
+    band: Band = "L1"  #: Frequency band on which the messages are sent.
     #: Notes on the messages and corrections of a recorded log; None for live messages.
     log_notes: tuple[str, ...] | None = None
 

@@ -27,24 +27,24 @@ from railfix.ranges.sbas.limits import SbasLimits
 from railfix.ranges.sbas.messages import SbasMessages
 from railfix.ranges.sbas.standard import NOT_MONITORED, OLDEST_S
 
-LONG_AGO: Final = GPS_EPOCH  #: Time before every message.
-ALARM: Final = 3  #: IODF of an alarm.
+LONG_AGO: Final = GPS_EPOCH  #: Time before any message.
+ALARM: Final = 3  #: IODF that marks an alarm.
 #: Longest time that a key can represent [ms]: 278 years, the range of `datetime64[ns]` after the GPS epoch.
 _SPAN: Final = np.int64(2**43)
 _MS: Final = np.int64(1_000_000)
 _OLDEST_MS: Final = np.int64(1000.0 * OLDEST_S)
-_NO_SERIES: Final = 2**19  #: Series of the placeholder row of an empty table, which no search returns.
+_NO_SERIES: Final = 2**19  #: Series number of the placeholder row of an empty table; no search returns this row.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Series:
     """Rows of many series (satellites, grid points ...) sorted by series and time of reception.
 
-    An empty table has one row that is never used, so that `columns` can be indexed with -1. Times of rows are rounded
-    up to the millisecond, and instants down, so that no row is used before it was received.
+    An empty table has one row that is never used, so that `columns` can be indexed with -1. Reception times are rounded
+    up to the millisecond, and the instants of searches down, so that no row is used before it was received.
     """
 
-    series: Integers  #: Number of the series, shape (n,).
+    series: Integers  #: Number of the row's series, shape (n,).
     time: Datetimes  #: Time of reception, shape (n,).
     columns: Mapping[str, NDArray[Any]]  #: Decoded values by name, shape (n, ...).
     key: Integers  #: Series and time of reception in one number, in ascending order; shape (n,).
@@ -138,13 +138,13 @@ class MaskTable:
         return table.in_force(row, time, self._stops.last(time), self._limit)
 
     def holds(self, number: Integers, time: Datetimes) -> tuple[Masks, Masks]:
-        """Return masks of epochs (T,) with an active PRN mask, and of satellites (T, K) in this PRN mask."""
+        """Return True for epochs (T,) with an active PRN mask, and for satellites (T, K) in the PRN mask in force."""
         row = self._by_time.newest(0, time)
         known = self._in_force(self._by_time, row, time)
         return known, self._by_time["member"][row][:, np.maximum(number, 0)] & known[:, None]
 
     def current(self, slot: Integers, time: Datetimes) -> Integers:
-        """Return the mask numbers of slots by the newest mask, for messages without an IODP; -1 without a mask."""
+        """Return the mask numbers of slots in the newest mask (for messages without an IODP); -1 without a mask."""
         rows = self.by_issue.newest(np.arange(4)[None, :], time[:, None])
         issue = np.argmax(self.by_issue.received(rows), axis=1)
         best = np.take_along_axis(rows, issue[:, None], axis=1)[:, 0]
@@ -154,12 +154,12 @@ class MaskTable:
 class SatelliteTables:
     """Tables of all messages of one GEO that concern satellites, by PRN mask number.
 
-    `fast` has fast corrections; the column `fresh` is the satellite's first row after its last unmonitored row. `udre`
-    has the UDREI from fast corrections and type 6; `grows_from` is the reception time from which degradation and
-    time-out are counted. `fast_degradation` has type 7; `shortest` is the indicator with the shortest time-out in the
-    same message. `long_term` has long-term corrections; `other` is the last row with another IODE, -1 for none.
-    `covariance` has type 28, `degradation` type 10. `unused` counts corrections without a matching mask or fast
-    correction.
+    `fast` has fast corrections; its column `fresh` is the index of the satellite's first row after its latest earlier
+    unmonitored row. `udre` has the UDREI from fast corrections and type 6; `grows_from` is the reception time from
+    which degradation and time-out are counted. `fast_degradation` has type 7; `shortest` is the indicator with the
+    shortest time-out in the same message. `long_term` has long-term corrections; its column `other` is the index of the
+    satellite's latest earlier row with a different IODE, -1 if there is none. `covariance` has type 28, `degradation`
+    type 10. `unused` counts corrections without a matching mask or fast correction.
     """
 
     def __init__(self, messages: SbasMessages, limits: SbasLimits) -> None:
@@ -195,7 +195,7 @@ class SatelliteTables:
         row = fast.newest(number, time)
         iodf = np.repeat(six["iodf"], BLOCK, axis=1)[:, :SLOTS].ravel()
         fits = (row >= 0) & (number > 0) & ((iodf == ALARM) | (iodf == fast["iodf"][row]))
-        self.unused["UDREI of type 6 without a fast correction of their IODF"] += int((~fits & (number > 0)).sum())
+        self.unused["UDREI of type 6 without a fast correction of the same IODF"] += int((~fits & (number > 0)).sum())
         time, row, alarm = time[fits], row[fits], iodf[fits] == ALARM
         renewed = np.where(alarm, fast.time[row], time)
         return Series.of(
@@ -229,14 +229,14 @@ class SatelliteTables:
 
 
 def _with_fresh(fast: Series) -> Series:
-    """Add the column `fresh`: the last row so far that is the first of the satellite or follows an unmonitored row."""
+    """Add the column `fresh`: the index of the first row after the satellite's latest earlier unmonitored row."""
     begins = np.ones(len(fast.series), dtype=bool)
     begins[1:] = (fast.series[1:] != fast.series[:-1]) | (fast["udrei"][:-1] >= NOT_MONITORED)
     return fast.add_columns(fresh=np.maximum.accumulate(np.where(begins, np.arange(len(begins)), 0)))
 
 
 def _with_other(table: Series) -> Series:
-    """Add the column `other`: the last earlier row of the satellite with another issue of data, -1 for none."""
+    """Add the column `other`: index of the satellite's latest earlier row with a different IODE, -1 for none."""
     number, iode = table.series, table["iode"]
     changed = np.ones(len(number), dtype=bool)
     changed[1:] = (number[1:] != number[:-1]) | (iode[1:] != iode[:-1])

@@ -8,7 +8,7 @@ import numpy as np
 
 from railfix.core.arrays import Datetimes, Floats
 
-#: Refractivity constants [K/mbar, K^2/mbar], gas constant of dry air [J/kg/K], gravities [m/s^2].
+#: Refractivity constants [K/mbar, K^2/mbar], gas constant of dry air [J/kg/K], mean and surface gravity [m/s^2].
 _K1, _K2, _RD, _GM, _G = 77.604, 382_000.0, 287.054, 9.784, 9.80665
 _RTCA_LATITUDE: Final = np.array([15.0, 30.0, 45.0, 60.0, 75.0])  #: Latitudes of table A-2 [deg].
 #: Mean pressure [mbar], temperature [K], vapour pressure [mbar], temperature lapse rate [K/m] and vapour lapse rate by
@@ -32,7 +32,7 @@ _RTCA_SEASON: Final = np.array(
         [0.0, 0.33, 0.46, 0.74, 0.30],
     ]
 )
-#: Standard deviation of the vertical delay [m].
+#: Standard deviation of the vertical tropospheric delay [m].
 SIGMA_VERTICAL_M: Final = 0.12
 _LOWEST_DEG: Final = 2.0
 
