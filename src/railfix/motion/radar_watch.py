@@ -13,7 +13,7 @@ from railfix.core.nearest_times import nearest_rows
 from railfix.motion.samples import RadarSpeeds
 
 _WINDOW_NS: Final = 30_000_000_000  #: Length of the windows over which the ratio of the speeds is computed [ns].
-_LEAST_SPEEDS: Final = 10  #: Minimum number of speeds for a window to be used.
+_LEAST_SPEEDS: Final = 10  #: Windows with fewer compared speeds are not used.
 #: Largest time difference between a radar speed and the satellite-derived speed with which it is compared [ns].
 _NEAR_NS: Final = 150_000_000
 _MOVING_MPS: Final = 3.0  #: Lowest speed of the train at which speeds are compared [m/s].
@@ -21,8 +21,8 @@ _LEAST_BEFORE: Final = 5  #: Minimum number of windows required before a step.
 _MOST_BEFORE: Final = 20  #: Maximum number of windows used before a step.
 _AFTER: Final = 3  #: Number of windows used after a step.
 _SILENT: Final = 2  #: Number of consecutive windows without a radar speed that raise an alarm.
-_STEP: Final = 0.01  #: Smallest step of the ratio of the speeds that is reported.
-_SCATTERS: Final = 5.0  #: Smallest step that is reported, as a multiple of the scatter before it.
+_STEP: Final = 0.01  #: Smaller steps of the ratio of the speeds are not reported.
+_SCATTERS: Final = 5.0  #: Steps smaller than this multiple of the scatter before the step are not reported.
 _LEAST_SCATTER: Final = 0.001  #: Lower bound of the scatter of the ratio before a step.
 
 

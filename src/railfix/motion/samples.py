@@ -67,7 +67,7 @@ class StationRanges(Samples):
     #: Name of the radio station, shape (N,).
     station: Strings = field(default_factory=lambda: np.empty(0, dtype="<U1"))
     range_m: Floats = field(default_factory=lambda: np.empty(0))  #: Distance to the station, shape (N,).
-    #: Standard deviation reported by the ranging device; NaN if not reported; shape (N,).
+    #: Standard deviation of the distance, reported by the ranging device; NaN if not reported; shape (N,).
     sigma_m: Floats = field(default_factory=lambda: np.empty(0))
 
 

@@ -51,7 +51,7 @@ _MAP_LIMIT: Final = 0.015
 #: As `_MAP_LIMIT`, in sigmas of the difference while the wheel rolls; the larger of the two limits is used. This limit
 #: is required because a pitching body accelerates an accelerometer that is mounted high.
 _NOISE_SIGMAS: Final = 5.0
-_NOISE_S: Final = 30.0  #: Time constant with which the standard deviation of the pitch sines is estimated.
+_NOISE_S: Final = 30.0  #: Time constant with which the sigma of the difference of the pitch sines is estimated.
 _LATCH_MPS: Final = 0.15  #: Largest difference of wheel and inertial speeds at which a slip can end.
 _LATCH_SHARE: Final = 0.01  #: As `_LATCH_MPS`, but a fraction of the speed; the larger of the two limits is used.
 _LATCH_S: Final = 0.5  #: Time for which the speeds must agree before a slip ends.
@@ -64,9 +64,9 @@ SMOOTHING_S: Final = 0.2
 _STANDING_S: Final = 1.0  #: Time without a pulse after which the vehicle is assumed to be at rest.
 _STANDING_MPS: Final = 0.5  #: Largest inertial speed at which a train without pulses is assumed to be at rest.
 _PITCH_S: Final = 20.0  #: Time constant of the correction of a pitch integrated from the gyro.
-#: Largest plausible sine of the pitch from wheel and accelerometer: 0.035 for the line, and a margin.
+#: A larger sine of the pitch from wheel and accelerometer is not used: 0.035 for the line, and a margin.
 _STEEPEST: Final = 0.1
-_FASTEST_MPS: Final = 100.0  #: Largest plausible inertial speed.
+_FASTEST_MPS: Final = 100.0  #: A larger inertial speed is implausible; there is then no speed.
 #: Time for which the body pitches after a stop. After this time, the measured pitch is the pitch at standstill.
 _SETTLING_S: Final = 2.0
 _ROLLING_LIMIT: Final = 0.002  #: Change of the pitch sine since standstill that indicates rolling away.

@@ -49,7 +49,7 @@ class PulseSpeeds:
     #: Time at which each speed is valid, which precedes the requested instant, shape (N,); NaT without a speed.
     time: Datetimes
     speed_mps: Floats  #: Speed, negative backward, shape (N,); NaN if not available.
-    #: Standard deviation caused by jitter and clock resolution, without the wheel scale error, shape (N,).
+    #: Standard deviation of the speed from jitter and clock resolution, without the wheel scale error, shape (N,).
     sigma_mps: Floats
 
 

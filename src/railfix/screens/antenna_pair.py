@@ -58,7 +58,7 @@ class AntennaPairLimits(Settings):
     azimuth_error_deg: float = Field(default=3.5, ge=0.0, le=90.0)
     #: Both receivers share one clock ("common"), or a median removes the difference of their clocks ("median").
     clocks: Literal["common", "median"] = "median"
-    #: Minimum number of common satellites in a constellation, with clocks "median".
+    #: With clocks "median", constellations with fewer common satellites are not tested.
     least_satellites: int = Field(default=4, ge=3)
     #: Epochs are paired if their time tags differ by at most this.
     tag_tolerance_s: float = Field(default=0.01, ge=0.0, lt=1.0)

@@ -146,7 +146,7 @@ class DopplerState:
     #: Satellite and signal of each channel; the next chunk may have different channels.
     satellite: Strings = field(default_factory=lambda: np.empty(0, dtype="<U3"))
     signal: Strings = field(default_factory=lambda: np.empty(0, dtype="<U2"))
-    #: Observations, NaN where absent.
+    #: Observations at the last epoch, NaN where absent.
     code_m: Floats = field(default_factory=lambda: np.empty(0))
     doppler_hz: Floats = field(default_factory=lambda: np.empty(0))
     code_sigma_m: Floats = field(default_factory=lambda: np.empty(0))

@@ -85,22 +85,22 @@ class InterferenceLimits(Settings):
     spread_db: float = Field(default=1.5, gt=0)
     peak_decay_db_per_min: float = Field(default=1.0, gt=0)  #: Decay rate of each satellite's C/N0 peak.
     known_after_s: float = Field(default=10.0, ge=0)  #: Falls of a satellite's C/N0 are used after this tracking time.
-    #: Minimum fall of the front-end gain, as a fraction of its recent peak, that counts as a sign. At receiver
-    #: start-up, the gain falls by up to 14 % without interference.
+    #: Falls of the front-end gain by less than this fraction of its recent peak are no sign. At receiver start-up, the
+    #: gain falls by up to 14 % without interference.
     gain_fall: float = Field(default=0.3, gt=0, lt=1)
     #: Largest standard deviation, over the satellites, of C/N0 values that count as equal. On the test recordings, this
     #: standard deviation is at least 1.2 dB.
     equal_db: float = Field(default=0.8, gt=0)
-    #: Minimum jump of the codes relative to the Dopplers, without whole milliseconds, that counts as a sign. Phone
+    #: Jumps of the codes relative to the Dopplers, without whole milliseconds, count as a sign if at least this. Phone
     #: clocks step by 30 m without interference.
     clock_jump_m: float = Field(default=60.0, gt=0)
     drift_jump_mps: float = Field(default=10.0, gt=0)  #: Jumps of the clock drift by more than this count as a sign.
     speed_jump_mps: float = Field(default=5.0, gt=0)  #: Jumps of the 3-D velocity by more than this count as a sign.
     position_jump_m: float = Field(default=30.0, gt=0)  #: Jumps of the 3-D position by more than this count as a sign.
-    #: Minimum distance of the 3-D position from the line that counts as a sign. A yard is about 100 m wide.
+    #: Distances of the 3-D position from the line below this are no sign. A yard is about 100 m wide.
     off_map_m: float = Field(default=100.0, gt=0)
-    #: Minimum estimated time-tag error that counts as a sign. For correct time tags, the estimated error reaches 0.05 s
-    #: in towns, and 0.13 s with a phone and seven satellites.
+    #: Estimated time-tag errors below this are no sign. For correct time tags, the estimated error reaches 0.05 s in
+    #: towns, and 0.13 s with a phone and seven satellites.
     tag_error_s: float = Field(default=0.1, gt=0)
     tag_sigmas: float = Field(default=6.0, gt=0)  #: Time-tag errors below this many sigmas are no sign.
     #: If all positions fail a check for this time, this counts as a sign of interference.

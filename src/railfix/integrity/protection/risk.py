@@ -93,9 +93,9 @@ class RiskBudget(Settings):
     side_prior: float = Field(default=SUPPORTED_SIDE_PRIOR, ge=0, lt=1)
     #: Elevation up to which satellites count as low. A wall whose distance equals its height reaches 45 deg.
     side_elevation_deg: float = Field(default=45.0, gt=0, le=90.0)
-    #: Sets of satellites that may be faulty together. With "beside", these are the low satellites left, and right, of
-    #: the track. With "all", as in the filter, the satellites ahead and behind are two more sets. Levels are then up to
-    #: three times as large, because single-epoch geometry along the track is weak without one of these two sets.
+    #: Sets of satellites that may be faulty together. With "beside", there are two sets: the low satellites left and
+    #: right of the track. With "all", as in the filter, the satellites ahead and behind are two more sets. Levels are
+    #: then up to three times as large, because single-epoch geometry along the track is weak without one of these sets.
     late_sides: Literal["beside", "all"] = "beside"
     #: Whether the priors were measured on this line (``railfix error-model``). If they are assumed, every output calls
     #: the levels indicative, and no hourly risk is claimed. "measured" requires `local_prior` and `side_prior`.

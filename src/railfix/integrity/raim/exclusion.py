@@ -175,8 +175,8 @@ class Exclusion:
     #: Channels of the passing exclusion with the smallest statistic, even at inseparable epochs, shape (T, 2). The
     #: second is -1 for a single channel; both are -1 if no exclusion passes.
     best: Indices
-    #: Channels of the next best passing exclusion of as many channels, shape (T, 2); -1 as for `best`. At inseparable
-    #: epochs, only competing exclusions are considered.
+    #: Channels of the next best passing exclusion of as many channels, shape (T, 2); unused entries are -1. At
+    #: inseparable epochs, only competing exclusions are considered.
     alternative: Indices
     #: Range error of each channel of `best`, positive if the range is too long, shape (T, M); NaN for other channels.
     own_error_m: Floats

@@ -34,7 +34,7 @@ class ModelArrays(NamedTuple):
     misfit: Floats
 
 
-#: Arrays of `LinearModel` with epochs on the first axis.
+#: Fields of `LinearModel` whose first axis is the epochs.
 _BY_EPOCH: Final = ("root_weight", "clock_covariance_m2", "design", "covariance_m2", "misfit", "freedom")
 
 
@@ -145,7 +145,7 @@ class LinearModel:
 class Compact(RowArrays):
     """Residuals and projector of T epochs and n channels. At each epoch, the used channels are first."""
 
-    channel: Indices  #: Channel of the model for each index, shape (T, n).
+    channel: Indices  #: Channel number in `LinearModel` of each of the n channels, shape (T, n).
     used: Masks  #: True for used channels, shape (T, n).
     projector: Floats  #: Residual projector S, shape (T, n, n); 0 for unused channels.
     residual: Floats  #: Whitened residuals, shape (T, n).
