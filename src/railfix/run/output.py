@@ -183,7 +183,7 @@ class ParquetFile:
                 return self._waiting.put(table, timeout=_LOOK_S)
         if self._error is not None:
             raise self._error
-        raise ValueError(f"{self._path.name} has ended")
+        raise ValueError(f"{self._path.name} is closed already, so that no rows can be added")
 
     def _write(self) -> None:
         from polars.io.plugins import register_io_source

@@ -254,7 +254,7 @@ class RunRecord:
         )
         if not complete:
             raise InputFileError(
-                self.path / "run.json", "inputs must be a list of input, path and sha256; repeat the run"
+                self.path / "run.json", "inputs must be a list of entries with input, path and sha256; repeat the run"
             )
         return list(entries)
 

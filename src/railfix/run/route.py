@@ -60,8 +60,8 @@ ON_TRACK_COLUMNS: Final[dict[str, str]] = {
     "track_probability": "probability, given the whole log, that the train is on the route at this position; "
     "`tracks.csv` has the alternatives",
     "unmapped_probability": "probability, given the whole log, that the train is on a track that is not in the map",
-    "unconstrained_offset_m": "offset in plan, from `track`, of the 3-D position computed without the map at the "
-    "nearest second; positive to the right",
+    "unconstrained_offset_m": "offset in plan, from `track`, of the 3-D position that was computed without the map for "
+    "the nearest second; positive to the right",
     "unconstrained_up_m": "height above `track` of the 3-D position computed without the map, minus the antenna height "
     "if the vehicle is known",
 }

@@ -116,7 +116,7 @@ def prior_of_interlocking(text: str, network: Network) -> dict[str, float]:
         except ValueError:
             weight = np.nan
         if number < 0 or not 0.0 <= weight < np.inf:
-            raise SettingsError(f"--prior {pair!r}: expected NAME=WEIGHT, not negative")
+            raise SettingsError(f"--prior {pair!r}: expected NAME=WEIGHT, with a weight of at least 0")
         weights[network.names[number]] = weight
     if not sum(weights.values()) > 0.0:
         raise SettingsError(f"--prior {text!r}: all weights are 0")
@@ -293,7 +293,7 @@ def which_track_files(inputs: WhichTrackInputs, options: WhichTrackOptions, conf
     if inputs.rear and not options.spacing > 0.0:
         raise SettingsError("two antennas need --spacing, the distance from the rear to the front antenna")
     if (inputs.last is None) != (options.moved is None):
-        raise SettingsError("--last and --moved, the distance moved since then (0 if none), must be given together")
+        raise SettingsError("--last and --moved (distance since --last was written, 0 if none) must be given together")
     navigation = read_navigation(inputs.nav, **options.logs.arguments)
     base = None
     if options.base_place is not None:
