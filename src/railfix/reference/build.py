@@ -378,7 +378,7 @@ class _ReferenceBuilder:
 
 
 def _name_source(misclosures: Closings) -> str:
-    return f"{len(misclosures)} windows between fixes" if len(misclosures) >= WINDOWS else "settings"
+    return f"closing errors of {len(misclosures)} windows" if len(misclosures) >= WINDOWS else "settings"
 
 
 def _check_time(path: str, time: Datetimes, fix_time: Datetimes) -> None:
