@@ -64,7 +64,7 @@ class AntennaRows:
         return join_epochs([rows for rows, _ in found]), [state for _, state in found]
 
     def split(self, rows: Indices) -> Iterator[tuple[SearchIndex, Indices]]:
-        """Yield the search index of each antenna and its part of `rows` (ascending); skip antennas without rows."""
+        """Yield the search index of each antenna and its rows out of `rows` (ascending); skip antennas without rows."""
         if len(self.parts) == 1:
             if len(rows):
                 yield self.indices[0], rows

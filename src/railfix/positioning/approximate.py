@@ -16,7 +16,7 @@ from railfix.positioning.section_search import SectionLimits, find_section
 
 #: Standard deviation assumed for raw ranges [m].
 ANCHOR_SIGMA_M: Final = 10.0
-#: Step length at which the iteration ends [m]. Linearised ranges then have errors of at most 0.03 m.
+#: The iteration ends if the step is shorter than this [m]. Linearised ranges then have errors of at most 0.03 m.
 _TOLERANCE_M: Final = 1000.0
 #: Raw 3-D positions up to this distance from the line are moved to the line [m].
 MAX_FROM_LINE_M: Final = 1e5
@@ -25,7 +25,7 @@ MAX_FROM_LINE_M: Final = 1e5
 class ApproximatePosition(NamedTuple):
     """Antenna positions accurate to a few hundred metres, and gross code errors, T epochs by K channels."""
 
-    ecef_m: Floats  #: Shape (T, 3).
+    ecef_m: Floats  #: Antenna position, shape (T, 3).
     arc_m: Floats  #: Arc length of the nearest point of the line, shape (T,).
     gross: Masks  #: True for codes with gross errors, shape (T, K).
     unsure: Masks  #: True for epochs with gross errors that cannot be identified, shape (T,).

@@ -1,7 +1,7 @@
 r"""Speed along the track from carrier Dopplers.
 
 The range ``rho = |s - r| + omega / c (s_x r_y - s_y r_x)``, with the satellite s at ``t - rho / c``, has the derivative
-``rho' = (A + g . v) / (1 + A / c)``. A is the part caused by the satellite velocity, and ``g = d rho / d r``. A
+``rho' = (A + g . v) / (1 + A / c)``. A is the contribution of the satellite velocity, and ``g = d rho / d r``. A
 receiver that moves at speed v along the unit tangent e of the track measures
 
     ``-lambda D = (A + (g . e) v) / (1 + A / c) + d_r - d_s + T'``
@@ -38,7 +38,7 @@ _FLOOR_MPS: Final = 0.02  #: Noise of a Doppler at high C/N0.
 
 
 class DopplerSpeedLimits(Settings):
-    """Limits and weights of the Doppler speed."""
+    """Limits and weights for the estimation of the speed from Dopplers."""
 
     mask_deg: float = 10.0  #: Elevation mask.
     #: Noise of a Doppler at 45 dB-Hz: ``sigma^2 = floor^2 + (zenith 10^((45 - min(C/N0, 50)) / 20))^2``. Only the
@@ -53,7 +53,7 @@ class DopplerSpeedLimits(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class Dopplers(FrozenArrays):
-    """Dopplers of one receiver and satellite states, T epochs by K channels."""
+    """Satellite states, and the Dopplers of one receiver, T epochs by K channels."""
 
     time: Datetimes  #: Receiver time of each epoch, shape (T,).
     #: Satellite of each channel, shape (K,). At each epoch, only one channel of a satellite has values.
@@ -81,7 +81,7 @@ class DopplerSpeed:
     used: Masks  #: True for Dopplers used in the fit, shape (T, K).
     rejected: Masks  #: True for Dopplers rejected as outliers, shape (T, K).
     n_used: Integers  #: Number of Dopplers used, shape (T,).
-    scale: float  #: Ratio of the receiver's Doppler noise in the whole log to the noise assumed in the limits.
+    scale: float  #: Ratio of the receiver's Doppler noise in the whole log to the assumed noise (`zenith_mps`).
 
 
 def dopplers_of_log(
@@ -123,7 +123,7 @@ def doppler_speed(
     `ecef_m`, shape (T, 3), are antenna positions. Where they are NaN, no speed is computed. A position error of 10 m
     changes a range rate by 2 mm/s. `tangent`, shape (T, 3), are unit vectors along the track. Outliers are rejected one
     by one, the largest first, while enough satellites remain. The noise scale is estimated from the median of the
-    normalised residuals of the whole log.
+    absolute normalised residuals of the whole log.
     """
     limits = limits or DopplerSpeedLimits()
     shape = (len(dopplers), 3)
@@ -161,7 +161,7 @@ def doppler_speed(
 
 
 def _equations(dopplers: Dopplers, ecef_m: Floats, tangent: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return range rates, modelled as ``slope v + drift`` [m/s], slopes, and elevations [deg], shape (T, K)."""
+    """Return rates and slopes of the model ``rate = slope v + drift`` [m/s], and elevations [deg], shape (T, K)."""
     receiver, along = ecef_m[:, None, :], tangent[:, None, :]
     sat, velocity = dopplers.sat_ecef_m, dopplers.sat_velocity_mps
     _, sight = range_with_rotation(sat, receiver)

@@ -27,7 +27,7 @@ from railfix.track.trajectory import Trajectory
 GROSS_M: Final = 100.0
 #: Codes agree if the median of their absolute residuals is below this limit [m].
 AGREEING_M: Final = 30.0
-#: Minimum number of redundant ranges after an exclusion at a 3-D position, so that the result can be tested.
+#: Minimum number of redundant ranges that must remain after an exclusion based on a 3-D position.
 _LEFT_IN_SPACE: Final = 3
 #: With fewer redundant ranges than `_LEFT_IN_SPACE`, a range is excluded only if all other exclusions leave residuals
 #: larger by this factor.
@@ -42,7 +42,7 @@ _COARSE_STEPS: Final = 10
 _COARSE, _FINE = 1.0, 0.3
 _LONGEST_STEP_M: Final = 3e6
 _SETTLED_M: Final = 0.3
-_SINGULAR: Final = 1e-15  #: A normal matrix, scaled to unit trace, is singular up to this determinant.
+_SINGULAR: Final = 1e-15  #: A normal matrix of unit trace counts as singular if its determinant is at most this.
 
 
 def least_absolute(ranges: Ranges, start_ecef_m: Floats) -> Floats:
@@ -80,7 +80,7 @@ def residuals_at(ranges: Ranges, place_ecef_m: Floats) -> Floats:
 
 
 def gross_in_space(ranges: Ranges, start_ecef_m: Floats) -> Masks:
-    """Find raw codes with gross errors, shape (T, M), where the other codes agree on a 3-D position.
+    """Find raw codes with gross errors, shape (T, M), at epochs at which the other codes agree on a 3-D position.
 
     At least `_LEFT_IN_SPACE` redundant ranges must remain and agree. With fewer redundant ranges, a single range is
     rejected if all others agree without it, and if no other single exclusion leads to agreement.
@@ -100,7 +100,7 @@ def gross_in_space(ranges: Ranges, start_ecef_m: Floats) -> Masks:
 
 
 def _one_of_few(ranges: Ranges, start_ecef_m: Floats) -> Masks:
-    """Return a mask (T, M) of the only range without which all others agree within `AGREEING_M`."""
+    """Return a mask (T, M), true for a range if only its exclusion makes the rest agree within `AGREEING_M`."""
     epochs, channels = ranges.weight.shape
     epoch, channel = np.nonzero(ranges.weight > 0)
     each = ranges.take(epoch)
@@ -155,9 +155,9 @@ def disagreeing(ranges: Ranges, start_ecef_m: Floats) -> Masks:
 
 _COARSE_M: Final = 100.0  #: Spacing of line points in the coarse scan [m].
 _FINE_M: Final = 12.5  #: Spacing of line points in the fine scan [m].
-#: Largest usual difference between clocks of constellations [m]; up to 71 m in recordings.
+#: Difference between clocks of constellations that is normally not exceeded [m]; recordings have up to 71 m.
 _CLOCKS_APART_M: Final = 200.0
-#: A clock with one or two ranges is not used if it differs from the other clocks by more than this limit [m].
+#: A clock with one or two ranges is not used if it differs from the median clock by more than this [m].
 _CLOCK_AWAY_M: Final = 600.0
 #: Largest product of points, epochs and channels of a block.
 _BLOCK: Final = 2_000_000
@@ -172,9 +172,9 @@ class LineScan(NamedTuple):
 
     arc_m: Floats  #: Arc length of the best-fitting point, shape (T,).
     gross: Masks  #: True for ranges with a residual above `GROSS_M` at the point, shape (T, M).
-    #: Redundancy of the ranges without gross errors, shape (T,); 0 where they do not agree with the point.
+    #: Redundancy of the ranges without gross errors, shape (T,); 0 if these ranges do not agree with the point.
     agreeing: Integers
-    clear: Masks  #: True where all points with other gross errors have a clearly larger cost, shape (T,).
+    clear: Masks  #: True if all points at which other ranges have gross errors have a clearly larger cost, shape (T,).
 
 
 def scan_line(ranges: Ranges, line: Trajectory) -> LineScan:
@@ -215,8 +215,8 @@ def _line_residuals(ranges: Ranges, place_ecef_m: Floats) -> Floats:
 
     If residuals of a clock agree with the median of all clocks within `_CLOCKS_APART_M`, only these residuals determine
     the median of the clock. For an even number, the median is the mean of the two middle values, or one of these if its
-    `_capped_cost` is clearly smaller. This is necessary because the mean fits no range if half of the ranges have gross
-    errors.
+    `_capped_cost` is clearly smaller. A middle value is necessary because the mean fits no range if half of the ranges
+    have gross errors.
     """
     used, satellite = ranges.weight > 0, ranges.sat_ecef_m
     square = -2.0 * (place_ecef_m @ satellite.swapaxes(1, 2))
@@ -259,7 +259,7 @@ class GrossErrors(NamedTuple):
 _HEIGHTS_M: Final = (-500.0, 10_000.0)
 #: Epochs whose raw residuals have a root sum of squares below this are not examined [m].
 _QUIET_M: Final = 30.0
-#: Epochs with a 3-D position farther from the line are also examined [m].
+#: Epochs whose 3-D position is farther than this from the line are also examined [m].
 _BESIDE_M: Final = 1000.0
 
 
@@ -267,11 +267,11 @@ def gross_errors(ranges: Ranges, antennas: AntennaRows, point: SinglePoint) -> G
     """Find gross errors of raw ranges; `point` are the least-squares 3-D positions of all ranges.
 
     Epochs with large residuals, or with positions far from the line, are examined. Gross errors are identified at the
-    best point of the line (`scan_line`) if redundant ranges agree with it and every other exclusion has a clearly
-    larger cost. Where the ranges agree with no point of the line, gross errors are identified at a 3-D position
-    (`gross_in_space`). If neither method succeeds, the epoch is unsure. At an unsure epoch, the ranges with gross
-    errors at the best point are also marked, if they are at most half of the ranges and redundant ranges agree with the
-    point.
+    best point of the line (`scan_line`) if redundant ranges agree with it and the cost is clearly larger at all points
+    at which other ranges have gross errors. Where the ranges agree with no point of the line, gross errors are
+    identified at a 3-D position (`gross_in_space`). If neither method succeeds, the epoch is doubtful (`unsure`). At a
+    doubtful epoch, the ranges with gross errors at the best point are also marked, if they are at most half of the
+    ranges and redundant ranges agree with the point.
     """
     gross, arc = np.zeros(ranges.weight.shape, dtype=np.bool_), np.full(len(ranges), np.nan)
     unsure = np.zeros(len(ranges), dtype=np.bool_)
@@ -309,11 +309,11 @@ def gross_alone(
 ) -> Masks:
     """Find ranges of clocks that have few ranges and contradict the other clocks, shape (T, M).
 
-    If a clock is estimated separately, no other range tests its only range. Clocks are therefore compared with the
-    common clock, which is the median of all clocks minus their biases, weighted by the number of satellites. With
-    `ties`, the only range of a clock is marked if the clock differs by more than `GROSS_M`. Without `ties`, the one or
-    two ranges of a clock are marked if it differs by more than `_CLOCK_AWAY_M`. `clock_m`, shape (T, G), are clocks
-    estimated without ties.
+    No other range tests the only range of a separately estimated clock. Each clock (with `ties`, minus its bias) is
+    therefore compared with the median of all clocks, weighted by the number of satellites. With `ties`, the only range
+    of a clock is marked if the clock differs from the median by more than `GROSS_M`. Without `ties`, the ranges of a
+    clock with one or two ranges are marked if the clock differs from the median by more than `_CLOCK_AWAY_M`.
+    `clock_m`, shape (T, G), are clocks estimated without ties.
     """
     found = np.zeros(weight.shape, dtype=np.bool_)
     count = np.add.reduceat((weight > 0).astype(np.int64), [group.start for group in groups], axis=1)

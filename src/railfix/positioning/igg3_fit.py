@@ -49,7 +49,7 @@ def map_information(trajectory: Trajectory, section: Indices) -> Floats:
 
 
 def compute_information(axes: Floats, sigma_plan_m: float, sigma_height_m: float) -> Floats:
-    """Return the inverse ECEF covariance of the map error from unit vectors along, across and up, shape (T, 3, 3)."""
+    """Compute the inverse ECEF covariance of the map error, shape (T, 3, 3); `axes` point along, across and up."""
     across, up = axes[:, 1], axes[:, 2]
     return np.asarray(
         across[:, :, None] * across[:, None, :] / sigma_plan_m**2 + up[:, :, None] * up[:, None, :] / sigma_height_m**2
@@ -63,8 +63,8 @@ def robust_fit(
 
     `place_ecef_m`, shape (T, 3), are the positions at which the ranges are linearised.
 
-    `information`, shape (T, 3, 3) [1/m^2], is prior information on the position (`map_information`). With
-    `information`, one position unknown counts in the redundancy, otherwise three.
+    `information`, shape (T, 3, 3) [1/m^2], is prior information on the position (`map_information`). The redundancy is
+    computed with one position unknown if `information` is given, otherwise with three.
     """
     limits = limits or RobustFitLimits()
     used = ranges.weight > 0

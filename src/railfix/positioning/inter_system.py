@@ -27,7 +27,7 @@ from railfix.positioning.range_arrays import UNTIED_M, InterSystemBiases, Ranges
 
 
 class ClockOffsetLimits(Settings):
-    """Limits of the inter-system biases."""
+    """Limits of the estimation of inter-system biases."""
 
     #: Standard deviation of a bias about its mean; 1.0 m on an urban recording (Galileo, BeiDou). With infinity, every
     #: constellation has a separate clock.
@@ -47,10 +47,10 @@ class OffsetState:
     moment: Mapping[str, float] = field(default_factory=dict)  #: Information times bias [1/m].
     #: Time of the last epoch, NaT before the first.
     last: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    age: float = 0.0  #: Age of the last epoch since the start of the log, in windows of `window_s`.
+    age: float = 0.0  #: Time from the start of the log to the last epoch, in window lengths (`noise_windows`).
 
     def sums(self, letters: Sequence[str]) -> Floats:
-        """Return the information values of G clocks, then their moments, shape (2 G,); 0 for clocks without a bias."""
+        """Return `information` of G clocks, followed by their `moment`, shape (2 G,); 0 for clocks without a bias."""
         of_each = (self.information, self.moment)
         return np.array([values.get(letter, 0.0) for values in of_each for letter in letters], dtype=np.float64)
 
@@ -120,8 +120,8 @@ def tie_clocks(
 class PointPositions(NamedTuple):
     """3-D positions of T epochs and the inter-system biases."""
 
-    point: SinglePoint  #: Conventional position with one clock per constellation.
-    tied: SinglePoint  #: Conventional position with clocks tied by known biases.
+    point: SinglePoint  #: Least-squares position with one clock per constellation.
+    tied: SinglePoint  #: Least-squares position with clocks tied by known biases.
     free: SinglePoint  #: Position with one clock per constellation, from the ranges that agree with each other.
     disagreeing: Masks  #: True for used ranges that disagree with the position `free`, shape (T, K).
     ties: InterSystemBiases

@@ -25,7 +25,7 @@ from railfix.positioning.section_search import Section, SectionLimits, find_sect
 class FixLimits(NamedTuple):
     """Limits of the 3-D position, the section search and the position on the line."""
 
-    min_satellites: int = 3  #: Minimum number of satellites; 2 lead to wrong sections in sharp curves (P1 3.2).
+    min_satellites: int = 3  #: Minimum number of satellites; with 2, sections in sharp curves can be wrong (P1 3.2).
     single_point: SinglePointLimits = SinglePointLimits()
     section: SectionLimits = SectionLimits()
     constrained: ConstrainedLimits = ConstrainedLimits()
@@ -52,7 +52,7 @@ def fix_on_line(ranges: Ranges, line: Line, point: SinglePoint, limits: FixLimit
 
 
 def refit_epochs(ranges: Ranges, antennas: AntennaRows, fix: LineFix, epochs: Indices, limits: FixLimits) -> LineFix:
-    """Return `fix` after recomputing the positions of `epochs` (ascending) from `ranges`."""
+    """Return a copy of `fix` with the positions of the ascending `epochs` recomputed from `ranges`."""
     for index, own in antennas.split(epochs):
         part = ranges.take(own)
         solved = fix_on_line(

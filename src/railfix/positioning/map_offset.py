@@ -67,7 +67,7 @@ class MapOffsetState:
 
     #: Time of the last epoch; NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    age: float = 0.0  #: Age of the last epoch since the start of the log, in windows of `window_s`.
+    age: float = 0.0  #: Time from the start of the log to the last epoch, in window lengths (`noise_windows`).
     #: Nine sums for epochs on the map, then nine for epochs off the map, shape (18,): information matrix (3),
     #: information times offset (2), covariance of satellite and atmospheric errors (3), and number of samples.
     sums: Floats = field(default_factory=lambda: np.zeros(2 * _SUMS))
@@ -218,8 +218,8 @@ def terms_of_epochs(
 def means_of_windows(
     sums: Floats, sigma_plan_m: float, sigma_height_m: float, detectable_sigmas: float
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return mean offset (T, 2), covariance (T, 2, 2), statistic (T,) and detectable offsets (T, 2) of window sums (T,
-    9). The results are described at `MapOffset`.
+    """Compute from window sums (T, 9) mean offset (T, 2), covariance (T, 2, 2), statistic (T,) and detectable offsets
+    (T, 2), described at `MapOffset`.
     """
     of_noise = _inverse_2x2(sums[:, [0, 1, 1, 2]].reshape(-1, 2, 2))
     mean = np.einsum("tij,tj->ti", of_noise, sums[:, 3:5])

@@ -10,12 +10,12 @@ import numpy as np
 from railfix import kernels
 from railfix.core.arrays import Datetimes, Floats, Indices
 
-#: Time of an epoch, NaT if there is none, and its age [windows].
+#: Time of an epoch (NaT if there is none), and time since the start of the log in window lengths (`Windows.of`).
 Dated = tuple[np.datetime64, float]
 
 
 class Windows(NamedTuple):
-    """Ages of T epochs of A antennas, in windows since the start of the log."""
+    """Ages of T epochs of A antennas: times since the start of the log in window lengths."""
 
     step_s: Floats  #: Time since the previous epoch, shape (T,); 0 at the first epoch.
     growth: Floats  #: Exponential of the age since the start of the epoch's span (`kernels.windows.SPAN`), shape (T,).
@@ -27,10 +27,10 @@ class Windows(NamedTuple):
     def of(
         cls, time: Datetimes, parts: Sequence[slice], before: Sequence[Dated], *, window_s: float, least_epochs: float
     ) -> Windows:
-        """Compute the ages; `parts` are the rows and `before` the last earlier epoch of each antenna.
+        """Compute the ages. For each antenna, `parts` has its rows and `before` its last epoch of the previous chunk.
 
-        A window has the length `window_s` or `least_epochs` epochs, whichever is longer. A gap therefore counts as at
-        most 1 / `least_epochs` of a window.
+        A window has the length `window_s` or `least_epochs` epochs, whichever is longer. The time between two epochs,
+        even after a gap, therefore counts as at most 1 / `least_epochs` of a window.
         """
         times, ages = zip(*before, strict=True)
         ends = np.array([len(time) if rows.stop is None else rows.stop for rows in parts], dtype=np.intp)

@@ -2,12 +2,12 @@
 
 The clock of a constellation is eliminated by subtracting the weighted mean over its satellites from their residuals and
 design rows. This is equivalent to solving for the clock (Schur complement of the clock block). With known biases
-(`InterSystemBiases`), each mean minus its bias is an observation of a common clock, which is eliminated in the same
-way.
+(`InterSystemBiases`), the mean of a constellation minus its bias is an observation of a common clock, which is
+eliminated in the same way.
 
 In P1 2.2(3), the antenna is at ``R = r_i + d e_i`` on the section between two points of its trajectory. The plan and
-height errors of the map are two unknowns with their covariance as prior. This is equivalent to an additional covariance
-``H_m S_m H_m^T`` of the ranges. The single-point position is the reference method of P1 section 5.
+height errors of the map are two unknowns with design columns H_m and prior covariance S_m. This is equivalent to adding
+the covariance ``H_m S_m H_m^T`` to the ranges. The single-point position is the reference method of P1 section 5.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class ConstrainedLimits(Settings):
 
     #: Step length below which the iteration ends; the remaining error is at most 0.03 mm.
     tolerance_m: float = Field(default=5.0, gt=0)
-    max_iterations: int = Field(default=40, ge=1)  #: Largest number of steps, including section changes.
+    max_iterations: int = Field(default=40, ge=1)  #: Largest number of steps and section changes.
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -76,7 +76,7 @@ class Constrained(NotebookTable):
     """Positions along the line, T epochs."""
 
     arc_m: Floats  #: Arc length, shape (T,); NaN without a position or without convergence.
-    section: Indices  #: Section that contains the position, shape (T,); -1 without a position.
+    section: Indices  #: Index of the section that contains the position, shape (T,); -1 without a position.
     sigma_m: Floats  #: Standard deviation along the line from the weights and the map error, shape (T,).
     exact_map_sigma_m: Floats  #: Standard deviation along the line for an exact map, shape (T,).
     #: Standard deviation along the line for unit weights and an exact map, shape (T,); infinite if undetermined.
@@ -180,10 +180,10 @@ class SinglePointLimits(Settings):
     """Limits of the iteration for 3-D positions, and of the validation of these positions (`conventional_status`)."""
 
     tolerance_m: float = Field(default=1.0, gt=0)  #: Step length below which the iteration ends.
-    max_iterations: int = Field(default=12, ge=1)  #: Largest number of steps.
+    max_iterations: int = Field(default=12, ge=1)  #: Largest number of steps; there is no position without convergence.
     #: False-alarm probability of the chi-square test of the residuals.
     false_alarm: float = Field(default=1e-3, gt=0, lt=0.5)
-    #: Largest position dilution of precision. RTKLIB limits the geometric dilution of precision to 30.
+    #: Largest position dilution of precision of a valid position. RTKLIB: 30 for the geometric dilution of precision.
     dilution_limit: float = Field(default=30.0, gt=0)
 
 

@@ -43,7 +43,7 @@ class RangeArrays(NamedTuple):
 
     @property
     def tied(self) -> bool:
-        """True with inter-system biases."""
+        """True if inter-system biases tie the clocks."""
         return len(self.offset_m) == len(self.code_m)
 
     @property
@@ -67,7 +67,7 @@ class Ranges:
     code_m: Floats  #: Corrected pseudoranges, shape (T, M); any finite value for unused ranges.
     weight: Floats  #: Weights 1/sigma^2, shape (T, M) [1/m^2]; 0 for unused ranges.
     groups: tuple[slice, ...]  #: Adjacent channels of each receiver clock, one slice per clock.
-    ties: InterSystemBiases | None = None  #: Known clock offsets; None for separate clocks.
+    ties: InterSystemBiases | None = None  #: Known inter-system biases; None for separate clocks.
 
     def __len__(self) -> int:
         return len(self.code_m)
@@ -145,7 +145,7 @@ def weighted_ranges(
     sigma = _check_floats("sigma_m", sigma_m, 2)
     satellite = _check_floats("sat_ecef_m", sat_ecef_m, 3)
     if sigma.shape != code.shape:
-        raise ValueError(f"sigma_m has shape {sigma.shape}, expected that of code_m, {code.shape}")
+        raise ValueError(f"sigma_m has shape {sigma.shape}, but code_m has {code.shape}")
     if satellite.shape != (*code.shape, 3):
         raise ValueError(f"sat_ecef_m has shape {satellite.shape}, expected {(*code.shape, 3)}: x, y, z of each code")
     if len(clock) != code.shape[1]:

@@ -19,7 +19,7 @@ from railfix.core.arrays import Floats, Integers, Masks, channel_sums
 from railfix.core.settings import Settings
 from railfix.positioning.noise_windows import Windows
 
-#: Largest number of degrees of freedom for which Student's t is evaluated.
+#: Larger numbers of degrees of freedom count as this number in the quantile of Student's t.
 _MOST_FREEDOM: Final = 128
 
 
@@ -46,10 +46,10 @@ class NoiseState:
 
     #: Time of the last epoch; NaT before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    age: float = 0.0  #: Age of the last epoch since the start of the log, in windows of `window_s`.
-    #: Weighted sum of squared residuals and degrees of freedom of the ranges kept by the robust fit, shape (2,).
+    age: float = 0.0  #: Time from the start of the log to the last epoch, in window lengths (`noise_windows`).
+    #: Weighted sum of squared residuals, and sum of degrees of freedom, of ranges kept by the robust fit, shape (2,).
     robust: Floats = field(default_factory=lambda: np.zeros(2))
-    #: Sums as in `robust` for the ranges accepted by RAIM, shape (2,).
+    #: The sums of `robust`, but for the ranges accepted by RAIM, shape (2,).
     remaining: Floats = field(default_factory=lambda: np.zeros(2))
 
 
@@ -66,8 +66,8 @@ def noise_scale(
 ) -> tuple[Floats, Floats]:
     """Return the noise scale, shape (T,), and the new sums, shape (A, 2).
 
-    The noise scale (1 in P4) is the root mean square of the normalised residuals of the earlier epochs in the mask
-    `teaching`, with exponential forgetting. It is at least `least`. The prior value is `prior`, shape (T,); if
+    The noise scale (1 in P4) is the root mean square of the normalised residuals of those earlier epochs that
+    `teaching` marks, with exponential forgetting. It is at least `least`. The prior value is `prior`, shape (T,); if
     `limits.prior` is infinite, only this value is used. `start`, shape (A, 2), are the sums of the previous chunk.
     """
     use = teaching & (freedom > 0) & np.isfinite(wsse)

@@ -37,7 +37,7 @@ class SearchIndex:
 
     @cached_property
     def stretches(self) -> tuple[Indices, Floats, Indices]:
-        """Middle points and radii [m] of all stretches, shape (S,), and the first index of each stretch length."""
+        """Middle points and radii [m] of all stretches, shape (S,), and each stretch length's first index in them."""
         middles, radii = zip(*self.levels, strict=True)
         return np.concatenate(middles), np.concatenate(radii), np.cumsum([0, *map(len, middles)])
 
@@ -47,9 +47,9 @@ class SearchIndex:
         return self.trajectory.nearest(self.trajectory.ecef_m)[0]
 
     def clear_of_tangent_m(self, arc_m: Floats) -> Floats:
-        """Return the horizontal radius around each position in which line and tangent coincide, shape (T,) [m].
+        """Return the horizontal distance from each position within which the line follows its tangent, shape (T,) [m].
 
-        The radius is at most `CLEAR_M` and is valid for all positions on a section.
+        The distance is at most `CLEAR_M`, and equal for all positions on a section.
         """
         line = self.trajectory
         section = line.segment_at(arc_m)[0]

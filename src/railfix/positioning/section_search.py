@@ -3,9 +3,9 @@
 P1 2.2(2) compares differences of ranges between satellites with the differences of computed distances. The weighted sum
 of squares ``q`` of these comparisons equals the weighted sum of squared residuals after elimination of the clocks.
 `find_section` finds the point with the least ``q`` in a time that hardly depends on the length of the line. If a 3-D
-position exists, ``q`` increases from this position as a quadratic form, so that only points inside a ball are
-evaluated. Otherwise, the search is coarse to fine. It uses a bound: between two points, the root of ``q`` changes by at
-most the distance times the root of the summed weights. Both searches are exact.
+position exists, ``q`` is nearly a quadratic form with its minimum there, so that only points inside a ball around it
+are evaluated. Otherwise, the search is coarse to fine. It uses a bound: between two points, the root of ``q`` changes
+by at most the distance times the root of the summed weights. Both searches are exact.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from railfix.positioning.normal_equations import SinglePoint, misfit, normal_equ
 from railfix.positioning.range_arrays import Ranges
 from railfix.positioning.search_index import SearchIndex
 
-#: Probability that noise alone causes an excess of q above the search limit for alternative positions. The search limit
-#: is larger than the ambiguity threshold, because a range fault can increase q at the true position.
+#: Probability that noise alone causes an excess of q above `reach`, up to which alternative positions are searched.
+#: `reach` is larger than the ambiguity threshold, because a range fault can increase q at the true position.
 _REACH_RISK: Final = 1e-16
 
 
@@ -38,7 +38,7 @@ class SectionLimits(Settings):
     #: Probability that noise makes the true position fit worse than the best position by more than the threshold
     #: (chi-square, one degree of freedom). P1 3.2 describes wrong sections on sharp curves.
     ambiguity_risk: float = Field(default=1e-3, gt=0, lt=1)
-    separation_m: float = Field(default=30.0, ge=0)  #: Minimum distance along the line of an alternative position.
+    separation_m: float = Field(default=30.0, ge=0)  #: Minimum arc length between the best and an alternative position.
     #: Minimum number of redundant ranges of a reliable section. On recordings with two constellations, a quarter of the
     #: sections were wrong with one redundant range, but 3 to 4 % with two.
     redundancy: int = Field(default=2, ge=0)
@@ -65,14 +65,14 @@ class Section:
     #: best fit (at least 1), shape (T,); infinite without an alternative. Because both values of q are interpolated
     #: between points, the excess can be negative.
     excess: Floats
-    other_vertex: Indices  #: Point nearest to the alternative position, shape (T,); -1 if none.
+    other_vertex: Indices  #: Index of the point nearest to the alternative position, shape (T,); -1 if none.
     evaluations: Integers  #: Number of points at which q was computed, shape (T,).
 
 
 class SectionCandidates(NamedTuple):
     """Evaluated points of n epochs, p points in total, sorted by epoch and point."""
 
-    at: Indices  #: Epochs, shape (n,).
+    at: Indices  #: Index of each epoch, shape (n,).
     points: Indices  #: Number of points of each epoch, at least 1, shape (n,).
     vertex: Indices  #: Trajectory index of each point, shape (p,).
     q: Floats  #: Weighted sum of squares at each point, shape (p,).
@@ -82,10 +82,10 @@ class SectionCandidates(NamedTuple):
 
 
 def find_section(ranges: Ranges, line: Line, point: SinglePoint, *, limits: SectionLimits | None = None) -> Section:
-    """Find the point of the line that fits the ranges best, by between-satellite single differences (P1 2.2(2)).
+    """Find, from between-satellite single differences, the point of the line that fits the ranges best (P1 2.2(2)).
 
-    At a point r, the residuals are ``v_i = P_i - |s_i - r|``. Their single differences, with full covariances, have the
-    weighted sum of squares ``q = sum_i w_i (v_i - mean)^2``. The mean is the weighted mean over the satellites of a
+    At a point r, the residuals are ``v_i = P_i - |s_i - r|``. Weighted with the full covariance, the sum of squares of
+    their single differences is ``q = sum_i w_i (v_i - mean)^2``. The mean is the weighted mean over the satellites of a
     clock.
 
     Parameters
@@ -168,7 +168,7 @@ def _in_ball(
         point.wsse[epochs], weight_norm[epochs],
     )  # fmt: skip
     if not np.all(count):
-        raise AssertionError(f"an empty ball at epochs {epochs[count == 0]}: the radius is below the nearest point")
+        raise AssertionError(f"no point of the line within the search radius at epochs {epochs[count == 0]}")
     if unsure.any():
         q[unsure] = misfit(ranges, index.trajectory.ecef_m[vertex[unsure]], np.repeat(epochs, count)[unsure])
     matrix = np.ascontiguousarray(point.matrix)
@@ -180,7 +180,7 @@ def _coarse_to_fine(
 ) -> tuple[SectionCandidates, Integers]:
     """Return the candidate points, and the number of points evaluated at each epoch.
 
-    Stretches of the line without a point that can fit within the noise are skipped.
+    Stretches of the line are skipped if noise cannot explain the residuals at any of their points.
     """
     points = index.trajectory.ecef_m
     upper = np.full(len(ranges), np.inf)

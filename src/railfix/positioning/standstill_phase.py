@@ -17,10 +17,10 @@ import scipy
 
 from railfix.core.arrays import Floats, Integers
 
-#: Integer vectors whose weighted square exceeds the least by more than this value are omitted. Their likelihood
-#: relative to the best vector is below exp(-20).
+#: Integer vectors are omitted if their weighted square exceeds the smallest weighted square by more than this. Their
+#: likelihood relative to the best vector is below exp(-20).
 _WITHIN: Final = 40.0
-_ROUNDING: Final = 1e-9  #: Smallest relative decrease of a conditional variance by an exchange.
+_ROUNDING: Final = 1e-9  #: Unknowns are exchanged only if a conditional variance decreases by more than this fraction.
 
 
 class IntegerSearch:
@@ -116,7 +116,7 @@ def _search(cycles: Floats, lower: Floats, variance: Floats, count: int, below: 
     return integers, np.array([square for square, _ in kept])
 
 
-#: Largest number of integer vectors in a likelihood.
+#: Largest number of integer vectors over which a likelihood is summed.
 _VECTORS: Final = 20
 #: Integer vectors are omitted if log(likelihood / likelihood of uniform phases) is below this value.
 _NEGLIGIBLE: Final = -5.0
@@ -126,15 +126,15 @@ _NEGLIGIBLE: Final = -5.0
 class MeanPhases:
     """Mean double differences of one antenna's carrier phases, for n satellite pairs."""
 
-    difference_m: Floats  #: Observed minus computed (at the origin), modulo the wavelength, shape (n,).
-    away: Floats  #: Derivatives with respect to the position east, north and up, shape (n, 3).
+    difference_m: Floats  #: Observed minus computed double difference at the origin, modulo the wavelength, shape (n,).
+    away: Floats  #: Derivatives of the double differences with respect to the position (east, north, up), shape (n, 3).
     wavelength_m: Floats  #: Carrier wavelength of each pair, shape (n,).
     covariance_m2: Floats  #: Covariance of `difference_m`, shape (n, n).
 
 
 @dataclass(frozen=True, kw_only=True)
 class CodePlace:
-    """Code position of one antenna, east, north and up of the origin, shape (3,) [m], and its covariance."""
+    """Code position of one antenna (east, north and up of the origin), shape (3,) [m], and the position covariance."""
 
     place_m: Floats
     covariance_m2: Floats
@@ -148,7 +148,7 @@ def phase_log_likelihood(
     *,
     fault_prior: float,
 ) -> Floats:
-    """Return the log likelihood of U position hypotheses from the phases of A antennas, given their codes, shape (U,).
+    """Return the log likelihood of U position hypotheses, shape (U,), for the phases of A antennas, given the codes.
 
     A hypothesis is a position with the mean `expected_m`, shape (U, 3 A), and the covariance `prior_m2`. With the
     probability `fault_prior`, the phases do not follow the model (slip, half cycle) and are uniformly distributed over

@@ -35,7 +35,7 @@ _BETWEEN_SHARE: Final = 0.1
 _BETWEEN_M: Final = 1.2
 #: No track is selected if the code position is more than this number of sigmas from the most probable track.
 _LARGEST_MISFIT: Final = 4.0
-#: The likelihood is integrated up to this distance before and behind the code position [m].
+#: The likelihood is integrated along the track up to this distance from the code position, in both directions [m].
 _REACH_M: Final = 40.0
 _LEAST_ELEVATION_DEG: Final = 10.0  #: Errors below this elevation are as large as at this elevation.
 #: Residual atmospheric error of the phase difference of two receivers, as a fraction of the distance between them.
@@ -48,9 +48,9 @@ _ANY_PLACE_M: Final = 50.0
 _MISFIT: Final = 1e-4
 NONE: Final = "none"
 _FREEDOM: Final = 8.0  #: Degrees of freedom of the Student's t distribution of height errors.
-#: Probability that an undetected slip or half cycle affects the phases of a standstill.
+#: Probability that, during a standstill, an undetected slip or half cycle affects the phases.
 _PHASE_FAULT_PRIOR: Final = 1e-3
-_UNMAPPED_WIDTH_M: Final = 60.0  #: Width of the strip that may contain a missing track.
+_UNMAPPED_WIDTH_M: Final = 60.0  #: Width of the strip along the nearest track that may contain an unmapped track [m].
 
 
 class StandstillErrors(Settings):
@@ -66,14 +66,14 @@ class StandstillErrors(Settings):
     #: Standard deviation of a satellite's constant phase error at the zenith. It is divided by the sine of the
     #: elevation.
     phase_bias_m: float = option("Constant phase error of a satellite at the zenith.", 0.005, metavar="M", gt=0)
-    #: Standard deviation of each antenna's position on the train (antenna spacing, sway and lean), along and across.
+    #: Standard deviation per axis of each antenna's position on the train (antenna spacing, sway and lean).
     antenna_sigma_m: float = Field(default=0.05, gt=0)
     #: Standard deviation of the lateral map error common to all tracks of a yard, including antenna shifts due to cant.
-    map_sigma_m: float = option("Error of the map across the track, common to all its tracks.", 0.3, metavar="M", ge=0)
+    map_sigma_m: float = option("Lateral error of the map, common to all mapped tracks.", 0.3, metavar="M", ge=0)
 
-    #: If None, the height is `ANTENNA_UP_M`, with the standard deviation `ANTENNA_SIGMA_M` for usual vehicle heights.
+    #: If None, the height is `ANTENNA_UP_M`; its standard deviation `ANTENNA_SIGMA_M` covers usual vehicles.
     antenna_up_m: float | None = option(
-        "Height of the antennas above the rails, for tracks above each other; by default about 2.5 m.",
+        "Height of the antennas above the rails, to distinguish tracks at different levels; by default about 2.5 m.",
         None,
         name="--antenna-height",
         metavar="M",
@@ -93,7 +93,7 @@ class StandstillErrors(Settings):
         return np.asarray(np.hypot(np.sqrt(2.0) * self.phase_bias_m, _PHASE_SHARE * distance_m) / _sine(elevation_deg))
 
     def mean_noise_m(self, elevation_deg: Floats, seconds: float) -> Floats:
-        """Return the standard deviation of the varying code error, averaged over a time T of `seconds` [m].
+        """Return the standard deviation of the mean of the varying code error over a time T of `seconds` [m].
 
         Averaging a Gauss-Markov process multiplies its variance by 2 tau/T (1 - tau/T (1 - exp(-T/tau))).
         """
@@ -113,9 +113,9 @@ class StandstillFix:
     east_north_m: Floats  #: Position east and north of the yard's origin, shape (2,).
     own_m2: Floats  #: Covariance due to code bias and noise of this antenna, shape (2, 2).
     common_m2: Floats  #: Covariance due to satellite and atmospheric errors, common to all antennas, shape (2, 2).
-    misfit: float  #: Weighted sum of squared residuals.
+    misfit: float  #: Weighted sum of squared code residuals.
     freedom: int  #: Degrees of freedom of `misfit`.
-    place: CodePlace | None = None  #: Position with height.
+    place: CodePlace | None = None  #: Position including the height.
 
     @property
     def fits(self) -> bool:
@@ -137,8 +137,8 @@ def standstill_fix(
     """Estimate an antenna position at standstill from mean code residuals; return None if it is undetermined.
 
     All arrays have the shape (K,). `system` has clock letters. `residual_m` has observed minus computed codes at the
-    origin, averaged over `seconds`. `common_m` has the sigmas of satellite and atmospheric errors. `receivers` is 2 if
-    the codes of a base station are subtracted.
+    origin, averaged over `seconds`. `common_m` has the sigmas of satellite and atmospheric errors. `receivers` is the
+    number of receivers whose errors affect the codes: 2 if the codes of a base station are subtracted, otherwise 1.
     """
     letters = np.unique(system)
     azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
@@ -174,7 +174,7 @@ class YardTrack:
 
     name: str
     points_m: Floats
-    up_m: float = np.nan  #: Height of the track near the origin, above the origin; NaN if unknown.
+    up_m: float = np.nan  #: Height, relative to the origin, of the track near the origin; NaN if unknown.
     sigma_up_m: float = 0.0  #: Standard deviation of `up_m`.
 
 
@@ -314,7 +314,7 @@ def _with_phases(
 
 
 def _spread(heading: Floats, errors: StandstillErrors) -> Floats:
-    """Return the covariance of A antenna positions, shape (3 A, 3 A), with common along-track and map errors."""
+    """Return the covariance of A antenna positions, shape (3 A, 3 A); along-track and map errors are common to them."""
     count = len(heading)
     along = np.column_stack([heading, np.zeros(count)])
     right = np.column_stack([heading[:, 1], -heading[:, 0], np.zeros(count)])
@@ -324,7 +324,7 @@ def _spread(heading: Floats, errors: StandstillErrors) -> Floats:
 
 
 def _covariance(fixes: Sequence[StandstillFix], errors: StandstillErrors, tracks: Sequence[YardTrack]) -> Floats:
-    """Return the covariance of A code positions, shape (2 A, 2 A), with common `common_m2` and map errors."""
+    """Return the covariance of A code positions, shape (2 A, 2 A); they share `common_m2` and the map error."""
     nearest = min(tracks, key=lambda track: _distance(track.points_m, fixes[0].east_north_m))
     step = np.diff(nearest.points_m, axis=0)
     middle = nearest.points_m[:-1] + step / 2.0

@@ -5,11 +5,11 @@ The difference between the two corrected codes of a satellite does not depend on
 
     ``P2 - P1 = B + (ratio - 1) I + e2 - e1``
 
-where I is the error of the modelled ionospheric delay on the first frequency, and B is the receiver delay between the
-frequencies. I is the sum of a spatial field (an offset and two gradients, with the sigma of the model as prior) and a
-residual of each satellite. I and B are estimated from the mean code differences of all satellites by best linear
-prediction. The range is then estimated by least squares from both codes, corrected for the predicted ionospheric delay.
-The weights account for the remaining ionospheric error, which differs between the two codes.
+where I is the error of the modelled ionospheric delay on the first frequency, and B is the receiver delay of P2 minus
+the receiver delay of P1. I is the sum of a spatial field (an offset and two gradients, with the sigma of the model as
+prior) and a residual of each satellite. I and B are estimated from the mean code differences of all satellites by best
+linear prediction. The range is then estimated by least squares from both codes, corrected for the predicted ionospheric
+delay. The weights account for the remaining ionospheric error, which differs between the two codes.
 """
 
 from __future__ import annotations
@@ -29,35 +29,35 @@ from railfix.ranges.corrected import SecondCodes
 
 _FROM_MEAN_SIZE: Final = 1.2533  #: Inverse of the mean absolute value of a standard normal variable.
 _FIRST_SAMPLES: Final = 2.0  #: Number of samples that the prior noise scale of 1 counts as.
-_CLIP: Final = 2.5  #: Clipping limit of a satellite's mean code difference, in sigmas.
-_LEAST_SUSPICION_M: Final = 3.0  #: Minimum code difference of a suspected range [m].
+_CLIP: Final = 2.5  #: Deviations of a satellite's mean code difference from the fit count as at most this many sigmas.
+_LEAST_SUSPICION_M: Final = 3.0  #: Ranges with a smaller absolute `Combined.difference_m` are not suspected [m].
 
 
 class TwoFrequencyLimits(Settings):
     """Limits of the two-frequency combination."""
 
-    #: Time constant of the mean code differences. The error of the Klobuchar model changes over many minutes.
+    #: Time constant of forgetting code differences. The error of the Klobuchar model changes over many minutes.
     window_s: float = Field(default=600.0, gt=0)
     #: Epochs within this time count as one sample, because multipath errors at standstill are correlated.
     correlation_s: float = Field(default=60.0, gt=0)
-    #: Standard deviation of the difference between the broadcast group delays of two signals.
+    #: Standard deviation of the error of the difference between the broadcast group delays of two signals.
     delay_sigma_m: float = Field(default=0.2, gt=0)
-    #: Code difference, in standard deviations, above which the weight of the range is reduced.
+    #: Ranges are suspected if the code difference minus its prediction exceeds this many standard deviations.
     suspicion: float = Field(default=4.0, gt=0)
 
 
 @dataclass(frozen=True, kw_only=True)
 class TwoFrequencyState:
-    """Mean code differences so far, for Q pairs of signals of one satellite."""
+    """Mean code differences estimated so far, for Q pairs; a pair is two signals of the same satellite."""
 
     names: tuple[str, ...] = ()  #: Name of each pair.
-    #: Information of each pair [1/m^2], followed by the moment of each pair [1/m], shape (2 Q,).
+    #: Information of each pair [1/m^2], followed by information times mean code difference [1/m], shape (2 Q,).
     sums: Floats = field(default_factory=lambda: np.empty(0))
     #: Sum of the absolute normalised code differences, and number of code differences, shape (2,).
     scale: Floats = field(default_factory=lambda: np.zeros(2))
     #: Time of the last epoch, NaT before the first.
     last: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    age: float = 0.0  #: Age of the last epoch since the start of the log, in windows of `window_s`.
+    age: float = 0.0  #: Time from the start of the log to the last epoch, in window lengths (`noise_windows`).
 
     def with_pairs(self, names: tuple[str, ...]) -> tuple[TwoFrequencyState, Integers]:
         """Return the state after adding the pairs of a chunk, and the index of each of these pairs in the new state."""
@@ -78,8 +78,8 @@ class Combined(NotebookTable):
     """Pseudoranges from two codes, T epochs by K channels; NaN where only the first code is used."""
 
     code_m: Floats  #: Combined code, shape (T, K).
-    variance_m2: Floats  #: Variance of the combined code minus that of the first code, shape (T, K).
-    share: Floats  #: Weight of the second code, shape (T, K). The first code has 1 - `share`.
+    variance_m2: Floats  #: Variance of the combined code minus variance of the first code, shape (T, K).
+    share: Floats  #: Weight of the second code, shape (T, K). The weight of the first code is 1 - `share`.
     ionosphere_m: Floats  #: Ionospheric delay on the first frequency minus modelled delay, shape (T, K).
     ionosphere_sigma_m: Floats  #: Standard deviation of `ionosphere_m`, shape (T, K).
     difference_m: Floats  #: Code difference minus its prediction, shape (T, K).
@@ -99,9 +99,9 @@ def combine_codes(
     """Return combined codes and the new state. The ionospheric delay is estimated from earlier epochs.
 
     `code_m`, shape (T, K), are corrected first codes, NaN where unusable, and `noise_m` are their noise sigmas.
-    `field_m`, shape (T, K, 4), are signed standard deviations of the modelled ionospheric delay on the first frequency,
-    for the offset, the two gradients and the satellite's residual. `pairs` are the names and the groups of Q signal
-    pairs. All pairs of a group have the same receiver delay.
+    `field_m`, shape (T, K, 4), has the sigmas of the error of the modelled ionospheric delay on the first frequency due
+    to the offset, the two gradients and the satellite's residual, each with the sign of its effect. `pairs` are the
+    names and the groups of Q signal pairs. All pairs of a group have the same receiver delay.
     """
     names, groups = pairs
     own, number = state.with_pairs(names)
@@ -163,7 +163,7 @@ def combine_codes(
 def ionosphere_free(
     code_m: Floats, noise_m: Floats, second: SecondCodes, delays_m: tuple[Floats, ...], found: Combined
 ) -> Combined:
-    """Return the ionosphere-free combination of two codes; the test of their difference is unchanged.
+    """Return the ionosphere-free combination of two codes, with `difference_m` and `suspected` as in `found`.
 
     The combination is ``P = (ratio P1 - P2) / (ratio - 1)``. `delays_m` are the group delays in the corrections of the
     two codes, shape (T, K); they are added back. `found` is the result of `combine_codes`.
@@ -180,7 +180,7 @@ def ionosphere_free(
 def share_of_second(first_m2: Floats, second_m2: Floats, ratio: Floats, ionosphere_m2: Floats) -> tuple[Floats, Floats]:
     """Return the least-squares weight of the second code, and the variance of the code difference.
 
-    The code variances `first_m2` and `second_m2` exclude the ionosphere.
+    The code variances `first_m2` and `second_m2` do not contain the ionospheric error.
     """
     total = first_m2 + second_m2 + (ratio - 1.0) ** 2 * ionosphere_m2
     return (first_m2 - (ratio - 1.0) * ionosphere_m2) / total, total

@@ -24,8 +24,8 @@ from railfix.positioning.range_arrays import Ranges
 from railfix.positioning.standstill_phase import IntegerSearch
 from railfix.track.trajectory import Trajectory
 
-FREE_AMBIGUITY_M: Final = 1e4  #: Loose prior sigma of an ambiguity about its first value, for conditioning [m].
-FORGET_S: Final = 600.0  #: An arc that is not observed for this time ends [s].
+FREE_AMBIGUITY_M: Final = 1e4  #: Prior sigma of ambiguities about their first values; keeps matrices invertible [m].
+FORGET_S: Final = 600.0  #: An arc ends if it is not observed for a longer time than this [s].
 
 
 class PhaseLimits(Settings):
@@ -38,13 +38,13 @@ class PhaseLimits(Settings):
     #: default averages over about 100 s. With 0, ambiguities are constant.
     drift_m: float = Field(default=0.01, ge=0)
     hop_s: float = Field(default=10.0, gt=0)  #: Time step of the random walk.
-    #: Correlation time of code errors. Epochs within this time add no information on the ambiguities. The variance of
-    #: the ambiguities is therefore multiplied by correlation time / interval, at most up to the variance from codes
-    #: alone. The positions do not change. Use 0 for white noise, for example in simulations.
+    #: Correlation time of code errors. Several epochs within this time are no more informative for ambiguities than
+    #: one. The variance of the ambiguities is therefore multiplied by correlation time / interval, up to the variance
+    #: from codes alone. Positions are unaffected. Use 0 for white noise, for example in simulations.
     correlation_s: float = Field(default=20.0, ge=0)
     #: Number of linearisations. Each has a separate state, so that results do not depend on the division into chunks.
     passes: int = Field(default=2, ge=1)
-    #: Largest probability of a wrong integer at which ambiguities are fixed. Fixing requires a base station.
+    #: Ambiguities are fixed if the probability of a wrong integer is at most this. Fixing requires a base station.
     integer_risk: float = Field(default=1e-4, gt=0, lt=0.5)
     #: Prior probability of non-integer phases (multipath, half cycles).
     no_integer_prior: float = Field(default=1e-2, gt=0, lt=1)
@@ -111,7 +111,7 @@ def prepare_start(
     """
     shape = ranges.code_m.shape
     if phases.phase_m.shape != shape or phases.weight.shape != shape or phases.arc_id.shape != shape:
-        raise ValueError(f"phases have shape {phases.phase_m.shape}, expected that of the ranges {shape}")
+        raise ValueError(f"phases have shape {phases.phase_m.shape}, but the ranges have {shape}")
     if np.any((phases.weight > 0) & (phases.arc_id < 0)):
         raise ValueError("a phase with a positive weight has no arc (its arc_id is negative)")
     at = np.isfinite(arc_m)
@@ -126,7 +126,7 @@ def inverse_of_arcs(matrix: Floats, held: Floats) -> Floats:
     """Return the inverse of normal matrices of ambiguities, shape (..., A, A).
 
     With a separate phase clock, a constant common to all ambiguities is unobservable. It is chosen so that the mean of
-    the ambiguities with `held` equal to 1, shape (..., A), is zero. Ambiguity differences do not depend on this choice.
+    the ambiguities marked by `held`, shape (..., A), is zero. Ambiguity differences do not depend on this choice.
     """
     size = matrix.shape[-1]
     count = np.maximum(held.sum(axis=-1), 1.0)
@@ -168,7 +168,7 @@ def assemble_positions(
 
 
 _VECTORS: Final = 12  #: Number of compared integer vectors.
-#: Fractions of the ambiguity differences that are fixed together, tried in this order, strongest phases first.
+#: Fractions of the ambiguity differences to fix together, strongest phases first. They are tried in this order.
 _SHARES: Final = (1.0, 0.75, 0.5)
 
 
@@ -231,7 +231,7 @@ def fix_integers(
 
 
 def _differences(strength: Floats, group: Integers) -> tuple[Indices, Indices]:
-    """Return pairs of an arc and its group's reference arc, sorted by descending strength of the former."""
+    """Return pairs of an arc and its group's reference arc, sorted by descending strength of the first arc."""
     first, second = [], []
     for each in np.unique(group[group >= 0]).tolist():
         own = np.flatnonzero(group == each)

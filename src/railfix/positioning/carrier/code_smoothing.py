@@ -1,10 +1,10 @@
 """Cycle slips and gaps of carrier phases, and carrier-smoothed codes (Hatch filter).
 
-The phase change is compared with the Dopplers, ``(phase_k - phase_{k-1}) + lambda (D_k + D_{k-1}) / 2 dt``, or, where
+The phase change is compared with the Dopplers, ``(phase_k - phase_{k-1}) + lambda dt (D_k + D_{k-1}) / 2``, or, where
 Dopplers are missing, with the code change. The median over the channels is subtracted, because a receiver clock step is
 common to all channels. The true interval between epochs is the difference of the time tags minus the clock step of the
-codes. Some receivers step the phases together with the codes. If the phases do not have the step, they differ from the
-codes by whole milliseconds; `Slips.phase_m` has these added.
+codes. In some receivers, the phases have the same clock steps as the codes. In other receivers, the phases differ from
+the codes by whole milliseconds after a step; `Slips.phase_m` has these milliseconds added.
 
 The smoothed code is the phase plus the mean of code minus phase over the arc so far. This mean drifts by twice the
 change of the ionospheric delay. The window limits the effect: for a change of 1 mm/s and a window of 100 s, the error
@@ -32,7 +32,7 @@ from railfix.positioning.carrier.continuity import ChannelKeys, channel_keys, ro
 MILLISECOND_M: Final = 1e-3 * SPEED_OF_LIGHT
 #: A change common to all codes is a receiver clock step if it is larger than this [m].
 _CLOCK_STEP_M: Final = 1e4
-_COMMON: Final = 3  #: Minimum number of channels for a median.
+_COMMON: Final = 3  #: With fewer channels than this, the median counts as 0.
 
 
 class SlipReason(IntFlag):
@@ -42,7 +42,7 @@ class SlipReason(IntFlag):
     NO_PHASE = 1 << 0  #: No phase at this epoch; no arc begins.
     FIRST = 1 << 1  #: The channel had no phase at the previous epoch.
     LOSS_OF_LOCK = 1 << 2  #: Bit 0 of the receiver's loss-of-lock indicator is set.
-    HALF_CYCLE = 1 << 3  #: Bit 1 (half-cycle ambiguity) of this indicator has changed since the previous epoch.
+    HALF_CYCLE = 1 << 3  #: Bit 1 (half-cycle ambiguity) of the loss-of-lock indicator has changed.
     GAP = 1 << 4  #: The interval since the previous epoch exceeds `max_gap_s`.
     BREAK = 1 << 5  #: The log marks a break before this epoch.
     DOPPLER = 1 << 6  #: The phase change disagrees with the Dopplers.
@@ -54,8 +54,8 @@ class CycleSlipLimits(Settings):
 
     The Doppler test rejects a change above ``doppler_m + doppler_mps dt + jerk_mps3 dt^3 / 12``. The three terms are
     phase noise, mean Doppler noise, and the error of the trapezoidal rule for a motion with this jerk. A slip of one
-    cycle on L1 (0.19 m) is detected for intervals up to about 1 s, and of two cycles up to 1.5 s. The test on the track
-    (`continuity.track_jumps`) has no such limit.
+    cycle on L1 (0.19 m) is detected for intervals up to about 1 s, a slip of two cycles for intervals up to 1.5 s. The
+    test on the track (`continuity.track_jumps`) does not depend on the jerk.
     """
 
     #: An arc ends at a longer interval than this. Station logs have intervals of 30 s.
@@ -65,7 +65,7 @@ class CycleSlipLimits(Settings):
     doppler_m: float = Field(default=0.05, gt=0)
     #: Part of the Doppler test limit that is proportional to the interval.
     doppler_mps: float = Field(default=0.05, gt=0)
-    jerk_mps3: float = Field(default=0.5, gt=0)  #: Largest jerk of the antenna; passenger trains have less.
+    jerk_mps3: float = Field(default=0.5, gt=0)  #: Largest expected jerk; passenger trains have less.
     #: Limit of the change of code minus phase. Used if there is no Doppler or its limit is larger than this one.
     code_m: float = Field(default=10.0, gt=0)
 
@@ -79,7 +79,7 @@ class CycleSlipState:
     code_m: Floats = field(default_factory=lambda: np.empty(0))  #: Code, shape (M,).
     phase_m: Floats = field(default_factory=lambda: np.empty(0))  #: Phase before adding `step_ms`, shape (M,).
     doppler_mps: Floats = field(default_factory=lambda: np.empty(0))  #: Doppler times wavelength, shape (M,).
-    half_cycle: Masks = field(default_factory=lambda: np.empty(0, dtype=np.bool_))  #: Shape (M,).
+    half_cycle: Masks = field(default_factory=lambda: np.empty(0, dtype=np.bool_))  #: Half-cycle flags, shape (M,).
     step_ms: int = 0  #: Sum of the clock steps of the codes that did not occur in the phases [ms].
 
 
@@ -92,8 +92,8 @@ class Slips:
     #: Phase times wavelength, shape (T, M); NaN where phase or wavelength is unknown. Clock steps that only the codes
     #: have are added, so that codes and phases refer to the same clock.
     phase_m: Floats
-    doppler_metric_m: Floats  #: Metric of the Doppler test, shape (T, M); NaN where not testable.
-    code_metric_m: Floats  #: Metric of the code test, shape (T, M); NaN where not testable.
+    doppler_metric_m: Floats  #: Phase change minus Doppler and clock change, shape (T, M); NaN where not testable.
+    code_metric_m: Floats  #: Code change minus phase and clock change, shape (T, M); NaN where not testable.
     doppler_limit_m: Floats  #: Limit of `doppler_metric_m`, shape (T,).
     #: Receiver clock step of the codes since the previous epoch, shape (T,); 0 where no step is detected.
     clock_step_m: Floats
@@ -106,7 +106,7 @@ def median_or_zero(values: Floats) -> Floats:
 
 
 def _before(values: Floats, last: Floats) -> Floats:
-    """Return the values of the previous epoch for each epoch; `last` precedes the first epoch."""
+    """Return, for each epoch, the values of the previous epoch; for the first epoch, these are `last`."""
     return np.concatenate([last[None], values[:-1]])
 
 
@@ -231,10 +231,10 @@ class SmoothingLimits(Settings):
     #: Time constant; 100 s in DO-229D 2.1.4.1.5 because of the ionospheric drift. All codes of an arc have equal weight
     #: until the arc has this age. Afterwards, the weight of older codes decays.
     window_s: float = Field(default=100.0, gt=0)
-    #: With "own", the mean change of code minus phase over all channels counts as a clock. It is subtracted before
-    #: averaging and added afterwards. Telephones require "own", because their codes jump together by tens of metres. In
-    #: a town, smoothing with "own" reduced the 95 % error along the line from 10.8 to 7.0 m; with "shared", it was 50
-    #: m. Other receivers were not less accurate with "own".
+    #: With "own", the mean change of code minus phase over all channels counts as a clock change. It is subtracted
+    #: before averaging and added afterwards. Telephones require "own", because their codes jump together by tens of
+    #: metres. In a town, smoothing with "own" reduced the 95 % error along the line from 10.8 to 7.0 m; with "shared",
+    #: it was 50 m. With other receivers, "own" was as accurate as "shared".
     clocks: Literal["own", "shared"] = "own"
 
 
@@ -246,7 +246,7 @@ class SmoothingState:
     channels: ChannelKeys = ()
     #: First value of code minus phase on the current arc, shape (M,); NaN without an arc.
     base_m: Floats = field(default_factory=lambda: np.empty(0))
-    #: Mean of code minus phase, minus `base_m`, shape (M,).
+    #: Mean of code minus phase on the current arc, minus `base_m`, shape (M,).
     offset_m: Floats = field(default_factory=lambda: np.empty(0))
     #: Number of codes of the current arc, shape (M,).
     count: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
@@ -256,7 +256,7 @@ class SmoothingState:
 
 
 def _hold(values: Floats, at: Masks, first: Floats) -> Floats:
-    """Return the value at the last epoch marked by `at`, or `first` before any mark, shape (T, M)."""
+    """Return the value at the last marked epoch (`at`) so far, or `first` if none is marked yet, shape (T, M)."""
     rows = np.where(at, np.arange(1, len(values) + 1)[:, None], 0)
     rows = np.maximum.accumulate(rows, axis=0)
     return np.asarray(np.take_along_axis(np.concatenate([first[None], values]), rows, axis=0))
@@ -300,7 +300,7 @@ def smooth_codes(
     -------
     ndarray, shape (T, M) [m]
         Smoothed codes. Without a phase, and at the first epoch of an arc, this is the raw code. Where the code is
-        missing, the smoothed code continues on the phase arc; it is NaN without an arc.
+        missing, the smoothed code is extrapolated by the phase of the arc; it is NaN without an arc.
     SmoothingState
         State for the next chunk. The division into chunks changes the result only by rounding errors (1e-9 m).
     """

@@ -1,9 +1,9 @@
 """Detection of phase jumps on a known line, and numbering of phase arcs.
 
-Between two epochs, the unknowns are the distance moved along the line and the clock change. Every additional satellite
-tests the phases to a centimetre. Where the phase changes are inconsistent, the channels with the largest residuals are
-rejected one by one until the remaining channels agree. Arc numbers are unique in a run. They contain the letters of the
-channel and a count of its arcs.
+Between two epochs, the unknowns are the distance moved along the line and the clock change. Every satellite beyond two
+allows a check of the phases with an accuracy of about a centimetre. Where the phase changes are inconsistent, the
+channels with the largest residuals are rejected one by one until the remaining channels agree. An arc number is unique
+in a run; it contains the satellite, the signal and the count of the channel's arcs.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ ChannelKeys = tuple[tuple[str, str], ...]  #: Satellite and signal of each chann
 
 @dataclass(frozen=True, kw_only=True)
 class ArcState:
-    """Number of arcs so far of each channel, by `channel_code`."""
+    """Number of arcs that each channel has had so far, by `channel_code`."""
 
     count: Mapping[int, int] = field(default_factory=dict)
 
@@ -106,10 +106,10 @@ class ContinuityLimits(Settings):
     #: Standard deviation of vertical motion due to gradient errors, as a fraction of the distance moved. On a vertical
     #: curve of 2000 m radius, a position error of 5 m is a gradient error of 0.0025 rad.
     up_share: float = Field(default=0.003, gt=0)
-    sigmas: float = Field(default=4.5, gt=0)  #: Limit of a residual in standard deviations.
+    sigmas: float = Field(default=4.5, gt=0)  #: Phase changes with a residual above this many sigmas are rejected.
     #: Largest number of channels rejected at an epoch. If more channels disagree, all tested channels start new arcs.
     max_rejected: int = Field(default=8, ge=0)
-    max_gap_s: float = Field(default=31.0, gt=0)  #: Longest interval that is tested.
+    max_gap_s: float = Field(default=31.0, gt=0)  #: Phase changes over longer intervals are not tested.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,7 +138,7 @@ class TrackedPhases(NamedTuple):
     """Phases of T epochs by M channels."""
 
     phase_m: Floats  #: Corrected phases (`observation_model.corrected_phase_m`), shape (T, M); NaN if unused.
-    sat_ecef_m: Floats  #: Satellite positions of the phases, shape (T, M, 3).
+    sat_ecef_m: Floats  #: Satellite positions at the transmission times of the phases, shape (T, M, 3).
     slip: Masks  #: True where a slip is already known, so that the phase is not tested, shape (T, M).
 
 
@@ -153,7 +153,7 @@ def track_jumps(
     *,
     limits: ContinuityLimits | None = None,
 ) -> tuple[TrackJumps, ContinuityState]:
-    """Find phase changes that disagree with the other phases and the line; compute the distance moved.
+    """Find phase changes inconsistent with the other phase changes and the line; compute the distance moved.
 
     Parameters
     ----------

@@ -40,7 +40,7 @@ from railfix.positioning.carrier.observation_model import (
 from railfix.positioning.range_arrays import Ranges
 from railfix.track.trajectory import Trajectory
 
-SEGMENT_EPOCHS: Final = 64  #: Number of epochs computed together.
+SEGMENT_EPOCHS: Final = 64  #: Largest number of epochs computed together.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,7 +124,7 @@ def phase_positions(
 
 
 def _cuts(hop: Integers) -> list[Indices]:
-    """Divide epochs into segments of at most `SEGMENT_EPOCHS` epochs within one time step of the random walk."""
+    """Divide epochs into segments: at most `SEGMENT_EPOCHS` epochs, all in the same time step of the random walk."""
     blocks = np.arange(0, len(hop), SEGMENT_EPOCHS)
     starts = np.union1d(np.flatnonzero(np.diff(hop)) + 1, blocks)
     return np.split(np.arange(len(hop)), starts[1:])
@@ -139,7 +139,7 @@ def _segment(
     memory: Memory,
     limits: PhaseLimits,
 ) -> tuple[PhasePositions, Floats, Memory]:
-    """Return the positions of one segment, the arc lengths for the next linearisation, and the memory after it."""
+    """Return one segment's positions, the arc lengths for the next linearisation, and the memory after the segment."""
     arc_m, started = start
     used = phases.weight > 0
     lin = linearise(ranges, phases, trajectory, arc_m, clocks=limits.clocks)
@@ -155,7 +155,7 @@ def _segment(
     lin = shift_phases(lin, base)
     matrix, right = reduce(lin)
 
-    # a part ends where an arc begins, so that matrix sizes do not depend on the division into segments
+    # segments are cut at the starts of arcs, so that matrix sizes do not depend on the division into segments
     parts = []
     for part in np.split(np.arange(len(time)), np.unique(begin[begin > 0])):
         new = np.isin(begin, part[:1])
@@ -186,8 +186,8 @@ def _ambiguities(
     """Return the corrections to the ambiguities' first values at each epoch, their covariances, arcs and memory.
 
     The shapes are (T, M, 3) and (T, M, M). The ambiguities are computed from the normal equations of the epoch and all
-    earlier epochs. Arcs and memory are those after the last epoch. With `held`, the mean of the ambiguities is zero
-    (`inverse_of_arcs`).
+    earlier epochs. Arcs and memory are those after the last epoch. If `held` is true, the mean of the ambiguities is
+    zero (`inverse_of_arcs`).
     """
     count, row = len(memory.arc_id), np.arange(len(arc_id))[:, None]
     # channels without a phase are collected in an extra row and column
@@ -219,8 +219,8 @@ def _fix_epochs(
 ) -> tuple[Integers, Floats]:
     """Fix the ambiguities of each epoch in place; return `PhasePositions.n_fixed` and `PhasePositions.integer_risk`.
 
-    `floats` are the first values of each channel's ambiguity (T, M), the corrections to these values and their changes
-    for map errors of 1 m (T, M, 3), and the covariances (T, M, M).
+    `floats` has three items: first values of the ambiguities (T, M); corrections to the first values, and changes of
+    the ambiguities for map errors of 1 m (T, M, 3); covariances (T, M, M).
     """
     first, value, covariance = floats
     count, risk = np.zeros(len(value), dtype=np.int64), np.full(len(value), np.nan)
@@ -245,7 +245,7 @@ def _fix_epochs(
 
 
 def _with_arcs(memory: Memory, ids: Integers, first_m: Floats) -> Memory:
-    """Return the memory after adding new arcs, sorted by number; older arcs of the same channels are eliminated."""
+    """Add new arcs to the memory, whose arcs are sorted by number, and eliminate older arcs of the same channels."""
     if not len(ids):
         return memory
     memory = _without(memory, np.isin(decode_channel(memory.arc_id), decode_channel(ids)))
@@ -266,7 +266,7 @@ def _with_arcs(memory: Memory, ids: Integers, first_m: Floats) -> Memory:
 
 
 def _walk(memory: Memory, time: Datetimes, limits: PhaseLimits) -> Memory:
-    """Return the memory at the time step of `time`: absent arcs are eliminated, and process noise is added."""
+    """Return the memory at the time step that contains `time`, without expired arcs and with added process noise."""
     if not len(time) or not len(memory.arc_id):
         return memory
     before, now = number_hops(np.array([memory.time, time[0]]), limits)
@@ -275,7 +275,7 @@ def _walk(memory: Memory, time: Datetimes, limits: PhaseLimits) -> Memory:
     begin = GPS_EPOCH + np.timedelta64(int(now) * round(limits.hop_s * 1e9), "ns")
     memory = _without(memory, seconds(begin - memory.seen) > FORGET_S)
     variance = limits.drift_m**2 * float(now - before) * limits.hop_s
-    # (Lambda^-1 + v I)^-1 = (I + v Lambda)^-1 Lambda; the right side exists even if Lambda is singular
+    # (Lambda^-1 + v I)^-1 = (I + v Lambda)^-1 Lambda; the second expression exists even if Lambda is singular
     both = np.concatenate([memory.matrix, memory.right], axis=1)
     both = np.linalg.solve(np.eye(len(both)) + variance * memory.matrix, both)
     matrix, right = both[:, : len(both)], both[:, len(both) :]

@@ -29,13 +29,13 @@ from railfix.track.trajectory import Trajectory
 PhaseClocks = Literal["own", "shared"]
 
 PLACE: Final = 3  #: Number of position unknowns of an epoch: along, across, up.
-_FREE_M: Final = 1e5  #: Loose prior sigma of an unknown, for conditioning [m].
-_LEAST_TIE_M: Final = 1e-2  #: Minimum sigma of an inter-system bias [m].
+_FREE_M: Final = 1e5  #: Large prior sigma of an unknown, which keeps the normal matrices invertible [m].
+_LEAST_TIE_M: Final = 1e-2  #: Smaller sigmas of inter-system biases are replaced by this sigma [m].
 
 
 @dataclass(frozen=True, kw_only=True)
 class IntegerChannels:
-    """Channels whose ambiguities differ by integers of cycles."""
+    """Channels whose ambiguities differ by whole numbers of cycles."""
 
     wavelength_m: Floats  #: Carrier wavelength of each channel, shape (M,).
     group: Integers  #: Group of channels with equal clock and signal, shape (M,); -1 for real-valued ambiguities.
@@ -148,7 +148,7 @@ def linearise(
 
 
 def _level(values: Floats, weight: Floats) -> tuple[Floats, Floats]:
-    """Return the values minus each epoch's weighted mean, 0 where the weight is 0, and the means, shape (T,)."""
+    """Subtract each epoch's weighted mean; return differences, 0 where the weight is 0, and means, shape (T,)."""
     used = np.where(weight > 0, values, 0.0)
     total = weight.sum(axis=1)
     mean = (weight * used).sum(axis=1) / np.where(total > 0, total, 1.0)
@@ -186,12 +186,12 @@ def reduce(lin: Linearised) -> tuple[Floats, Floats]:
     """Return each epoch's information on the ambiguities after eliminating its own unknowns (Schur complement).
 
     The results are normal matrices (T, M, M) [1/m^2] and right-hand sides (T, M, 3) [1/m] for the observations and for
-    map errors of 1 m across and in height. A map error changes code and phase equally, by a column of the design. With
-    the prior of this map error, the right-hand side is ``prior_k C^T L^-1 e_k``.
+    map errors of 1 m across and in height. The right-hand side for the map error k is ``prior_k C^T L^-1 e_k``, where
+    prior_k is the prior information on this error and e_k is a unit vector.
     """
     gain = np.matmul(lin.inverse, lin.coupling)
-    # The sum of squared residuals is never negative, and the errors of the inverse enter squared. In contrast, diag(v)
-    # - C^T L^-1 C would lose all digits where an epoch has little information.
+    # A sum of squared residuals is never negative, and errors of the inverse affect it only in second order, whereas
+    # diag(v) - C^T L^-1 C would lose all digits where an epoch has little information.
     left = [
         (lin.code_weight, -np.matmul(lin.code_design, gain)),
         (lin.phase_weight, np.eye(gain.shape[2]) - np.matmul(lin.phase_design, gain)),
@@ -225,9 +225,9 @@ def own_unknowns(
 
     `ambiguity_m`, shape (T, M, 3), are each channel's ambiguity and its changes for map errors of 1 m across and in
     height. A map error that is constant over a run does not average out. The sigma therefore contains the larger of two
-    effects of the map error: the effect with given ambiguities, and the effect that also acts through the ambiguities.
-    `repeats`, shape (T,), are the numbers of epochs with equal code errors; they multiply the variance of the
-    ambiguities.
+    effects of the map error: the direct effect with fixed ambiguities, and the total effect, in which the map error
+    also changes the ambiguities. `repeats`, shape (T,), are the numbers of epochs in which code errors stay the same;
+    they multiply the variance of the ambiguities.
     """
     used = lin.phase_weight > 0
     known = np.where(used[..., None], ambiguity_m, 0.0)
