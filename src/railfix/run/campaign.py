@@ -248,7 +248,7 @@ def _row(run: CampaignRun, **values: Any) -> dict[str, Any]:
 
 
 def _find(folder: Path, pattern: str) -> list[tuple[Path, dict[str, str]]]:
-    """Return the files that match a pattern, each with the values of its fields, in order of their names.
+    """Return the files that match a pattern, each with the values of its fields, in the order of the file names.
 
     The path of a pattern with neither fields nor ``*`` is returned even if the file is missing; the run reports this.
     """

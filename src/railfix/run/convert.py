@@ -48,8 +48,8 @@ def convert_logs(
 
     Observations are written to `out`, and ephemerides to `nav_out`; a file whose path is None is not written. `rinex`
     selects version 3.04 or 4.02. Raise InputFileError if a log cannot be read, or if the logs lack the data for one of
-    the files. Raise OutputError if `out` and `nav_out` are the same file, or if one of them exists already, is an
-    input, or cannot be written.
+    the files. Raise OutputError if `out` and `nav_out` are the same file, or if one of them exists already (with
+    "refuse"), is an input, or cannot be written.
     """
     if out is not None and nav_out is not None and out.resolve() == nav_out.resolve():
         raise OutputError(f"{out}: is given by --out and by --nav-out; give another file for one of them")

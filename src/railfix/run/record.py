@@ -34,7 +34,7 @@ from railfix.tracking import TrackStatus
 PACKAGES: Final = ("numpy", "scipy", "polars", "pyproj", "pydantic", "hatanaka", "georinex", "japan-geoid")
 
 
-#: For each of these values [m], the record states how many protection levels of the filter are at most this value.
+#: For each of these values [m], the record states how many protection levels of the filter do not exceed it.
 WITHIN_M: Final = (20, 50)
 #: Statistics of an antenna without rows in the tables.
 NO_FIGURES: Final = {"along_sigma_m": None, "chainage_m": None, "protection_level": None, "filter": None}

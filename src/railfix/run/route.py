@@ -1,7 +1,7 @@
 """Route of a log through a network of tracks, found from the log itself, and probabilities of other tracks.
 
 One conventional position per second is matched to the network (`railfix.track.network_match`). Positions are computed
-on the most probable sequence of tracks, the route. The probabilities of all other tracks are reported.
+on the most probable sequence of tracks, the route. The probabilities of other tracks near the positions are reported.
 """
 
 from __future__ import annotations
