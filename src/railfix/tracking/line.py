@@ -34,7 +34,7 @@ class Line:
 
     @cached_property
     def axes(self) -> Floats:
-        """Axes at the points, shape (V, 3, 3): rows tangent (mean of adjacent segments), right and up."""
+        """Axes at the points, shape (V, 3, 3); the rows are tangent (mean of adjacent segments), right and up."""
         segment, up = self.segment, self.trajectory.up
         tangent = np.concatenate([segment[:1], segment[:-1] + segment[1:], segment[-1:]])
         tangent = tangent / np.linalg.norm(tangent, axis=1, keepdims=True)

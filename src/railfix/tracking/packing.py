@@ -62,7 +62,7 @@ def pack_sensors(sensors: SensorEpochs, time: Datetimes) -> Records:
 
 
 def list_sources(state: TrackState) -> list[str]:
-    """Return the names of the sub-filter sources in the order of the recursion."""
+    """Return the names of the sources that sub-filters exclude, in the order of the recursion."""
     return [*state.satellite.tolist(), *ix.CLOCKS, *bank.SENSORS.values(), *bank.OTHERS]
 
 

@@ -42,8 +42,8 @@ _KEPT: Final = np.array([ix.WHEEL, ix.FORCE_OFFSET, ix.RADAR])
 def places(chunk: Chunk, epoch: int, line: Line, limits: TrackingLimits) -> Floats:
     """Return the arc lengths [m] that are consistent with the codes of an epoch, the most likely first, shape (C,).
 
-    The positions are maxima of the likelihood with Student's t errors, more than `start_separation_m` apart. With fewer
-    than `REDUNDANT` redundant codes, no position is returned.
+    The positions are maxima, more than `start_separation_m` apart, of the likelihood with Student's t errors. With
+    fewer than `REDUNDANT` redundant codes, no position is returned.
     """
     channel = chunk.channel[epoch]
     has = channel["has"][:, ix.CODE] != 0
@@ -136,7 +136,7 @@ class Sought(NamedTuple):
     """Result of the position search before an epoch."""
 
     lost: bool  #: True if the search followed a loss of track.
-    parent: Indices  #: Index of each hypothesis at the previous epoch, shape (H,); -1 for a new hypothesis.
+    parent: Indices  #: For each hypothesis, its index at the previous epoch, shape (H,); -1 if it is new.
     #: For each hypothesis, the split that produced it, or None. The list is None if no hypothesis was split.
     splits: list[SplitHypothesis | None] | None
 
@@ -267,8 +267,8 @@ def _try_beside(state: TrackState, line: Line, limits: TrackingLimits) -> int:
     """Add hypotheses a short distance ahead of and behind each hypothesis; return the number of added hypotheses.
 
     Where a line turns back within some tens of metres, Dopplers fit forward travel before the bend as well as backward
-    travel beyond it, and equations linearised before the bend are not valid beyond it. Every lap gets neighbours,
-    because neighbours of the most probable lap alone would make other laps less probable.
+    travel beyond it, and equations linearised before the bend are not valid beyond it. Neighbours are added on every
+    lap, because neighbours of the most probable lap alone would make other laps less probable.
     """
     parents: list[int] = []
     room = (limits.most_hypotheses - state.hypotheses) // _BESIDE

@@ -1,8 +1,8 @@
 """Smoothed positions: filter estimates combined with all later measurements (docs/filter-equations.md).
 
 The smoother has the adjoint form of G. J. Bierman, Fixed interval smoothing with discrete measurements, 1973,
-doi:10.1080/00207177308932424. It uses the measurement weights of the filter, and follows the last hypothesis backward
-to its beginning. Information of later epochs is not propagated beyond this beginning.
+doi:10.1080/00207177308932424. It uses the measurement weights of the filter, and follows the hypothesis reported at the
+last epoch backward to its beginning. Information of later epochs is not propagated beyond this beginning.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Smoothed:
 def smooth_steps(
     steps: list[Step], before: TrackState, later: BackwardInformation | None, limits: TrackingLimits
 ) -> tuple[Smoothed, BackwardInformation]:
-    """Return the smoothed positions of a chunk, and the information for the previous chunk (G. J. Bierman, 1973).
+    """Return the smoothed positions of a chunk, and information to pass to the previous chunk (G. J. Bierman, 1973).
 
     Parameters
     ----------

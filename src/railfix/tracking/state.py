@@ -42,7 +42,7 @@ class Monitors:
     branch_s: float = 0.0  #: Time since the start of the hypotheses [s].
     branch_m: float = 0.0  #: Distance travelled since the start of the hypotheses [m].
     distance_since_code_m: float = 0.0  #: Distance travelled since codes were last used [m].
-    direction: float = 0.0  #: Sign of the last speed with a known direction.
+    direction: float = 0.0  #: Sign of the last speed whose direction was known.
     #: Bounds of the speed that follow from earlier speeds (`railfix.kernels.tracking.model.narrow_speed_range`). With
     #: several hypotheses, the bounds are infinite.
     least_speed_mps: float = ANY_SPEED[0]
@@ -100,7 +100,7 @@ class TrackState:
     offset_known: Masks = field(default_factory=lambda: np.zeros(len(ix.CLOCKS), dtype=np.bool_))
     previous: Previous | None = None
     monitors: Monitors = field(default_factory=Monitors)
-    bank: Bank | None = None  #: Sub-filters; None without levels.
+    bank: Bank | None = None  #: Sub-filters; None if protection levels are off.
 
     @property
     def hypotheses(self) -> int:
