@@ -83,7 +83,7 @@ class AntennaRows:
         return self.each(lambda index, rows: index.trajectory.chainage_at(arc_m[rows]))
 
     def segment_at(self, arc_m: Floats) -> Indices:
-        """Return the section that contains each arc length, shape (T,); see `Trajectory.segment_at`."""
+        """Return the index of the section that contains each arc length (`Trajectory.segment_at`), shape (T,)."""
         return self.each(lambda index, rows: index.trajectory.segment_at(arc_m[rows])[0])
 
     def get_axes(self, section: Indices) -> Floats:

@@ -18,7 +18,7 @@ from railfix.positioning.section_search import SectionLimits, find_section
 ANCHOR_SIGMA_M: Final = 10.0
 #: The iteration ends if the step is shorter than this [m]. Linearised ranges then have errors of at most 0.03 m.
 _TOLERANCE_M: Final = 1000.0
-#: Raw 3-D positions up to this distance from the line are moved to the line [m].
+#: Raw 3-D positions are moved to the line if they are at most this far from it [m].
 MAX_FROM_LINE_M: Final = 1e5
 
 
@@ -26,7 +26,7 @@ class ApproximatePosition(NamedTuple):
     """Antenna positions accurate to a few hundred metres, and gross code errors, T epochs by K channels."""
 
     ecef_m: Floats  #: Antenna position, shape (T, 3).
-    arc_m: Floats  #: Arc length of the nearest point of the line, shape (T,).
+    arc_m: Floats  #: Arc length of the point of the line nearest to `ecef_m`, shape (T,).
     gross: Masks  #: True for codes with gross errors, shape (T, K).
     unsure: Masks  #: True for epochs with gross errors that cannot be identified, shape (T,).
 

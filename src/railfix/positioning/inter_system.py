@@ -32,7 +32,7 @@ class ClockOffsetLimits(Settings):
     #: Standard deviation of a bias about its mean; 1.0 m on an urban recording (Galileo, BeiDou). With infinity, every
     #: constellation has a separate clock.
     stability_m: float = Field(default=1.0, gt=0, allow_inf_nan=True)
-    #: Epochs within this time count as one sample, because errors at standstill are correlated over tens of seconds.
+    #: Epochs within this time are one sample, because errors at standstill are correlated over tens of seconds.
     correlation_s: float = Field(default=30.0, gt=0)
     #: Time constant of exponential forgetting. With the default, the effect of a receiver restart or of an undetected
     #: error decays within half an hour.

@@ -36,7 +36,7 @@ class LineFix(NotebookTable):
     """3-D positions and positions on the line of T epochs, from the same ranges."""
 
     point: SinglePoint  #: 3-D position without the map.
-    section: Section  #: Best-fitting vertex of the trajectory.
+    section: Section  #: Best-fitting point of the trajectory (section search).
     constrained: Constrained  #: Position on the line.
 
 

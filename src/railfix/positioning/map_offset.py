@@ -25,7 +25,7 @@ from railfix.positioning.noise_windows import correlated_sums
 from railfix.positioning.normal_equations import SinglePoint
 from railfix.positioning.range_arrays import RangeArrays, Ranges
 
-_SUMS: Final = 9  #: Number of sums of a window.
+_SUMS: Final = 9  #: Number of sums in `MapOffsetState.sums` for each of its two groups of epochs.
 
 
 class MapOffsetLimits(Settings):
@@ -34,8 +34,8 @@ class MapOffsetLimits(Settings):
     #: Time constant of exponential forgetting. The default corresponds to six independent samples, and is short enough
     #: to detect local map errors.
     window_s: float = Field(default=120.0, gt=0)
-    correlation_s: float = Field(default=20.0, gt=0)  #: Epochs within this time count as one sample.
-    least_samples: float = Field(default=3.0, gt=0)  #: Minimum number of independent samples for a decision.
+    correlation_s: float = Field(default=20.0, gt=0)  #: Epochs within this time count together as one sample.
+    least_samples: float = Field(default=3.0, gt=0)  #: With fewer independent samples, no offset is computed.
     #: Probability that noise alone causes a note on the map (chi-square, two degrees of freedom).
     note_risk: float = Field(default=1e-2, gt=0, lt=1)
     #: Probability that noise alone causes the status `map_offset`, if the nominal sigmas are correct. On recordings
@@ -117,7 +117,7 @@ class OffsetErrors(NamedTuple):
     """Range error statistics used for the map offset, T epochs."""
 
     nominal_m: Floats  #: Standard deviations of satellite and atmospheric errors, shape (T, M).
-    variance: Floats  #: Ratio of the range variance to the variance assumed in the weights, shape (T,).
+    variance: Floats  #: Ratio of the actual variance of ranges to the variance assumed in the weights, shape (T,).
 
 
 class LinePositions(NamedTuple):

@@ -134,8 +134,8 @@ def _on_line(
 ) -> tuple[Floats, Indices, Floats, Floats, Floats, Integers]:
     """Return arc lengths, and the results of `_from` with epochs on the last axis.
 
-    If a position is clamped to an end of a closed line, the iteration is repeated from the point where the line
-    continues, and the better fit is returned.
+    If a position is clamped to an end of a closed line, the iteration is repeated from the point where the line passes
+    this end again, and the better fit is returned.
     """
     section, solved, clock, residual, iterations = _from(start, ranges, trajectory, limits)
     for end, join in zip((0, len(trajectory) - 2), trajectory.joins_m, strict=True):

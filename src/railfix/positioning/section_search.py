@@ -35,12 +35,12 @@ _REACH_RISK: Final = 1e-16
 class SectionLimits(Settings):
     """Limits for ambiguous sections."""
 
-    #: Probability that noise makes the true position fit worse than the best position by more than the threshold
+    #: Probability that noise makes the true position fit worse than the best position by more than `threshold`
     #: (chi-square, one degree of freedom). P1 3.2 describes wrong sections on sharp curves.
     ambiguity_risk: float = Field(default=1e-3, gt=0, lt=1)
     separation_m: float = Field(default=30.0, ge=0)  #: Minimum arc length between the best and an alternative position.
-    #: Minimum number of redundant ranges of a reliable section. On recordings with two constellations, a quarter of the
-    #: sections were wrong with one redundant range, but 3 to 4 % with two.
+    #: A section with fewer redundant ranges than this is not reliable. On recordings with two constellations, a quarter
+    #: of the sections were wrong with one redundant range, but 3 to 4 % with two.
     redundancy: int = Field(default=2, ge=0)
 
     @cached_property
@@ -75,7 +75,7 @@ class SectionCandidates(NamedTuple):
     at: Indices  #: Index of each epoch, shape (n,).
     points: Indices  #: Number of points of each epoch, at least 1, shape (n,).
     vertex: Indices  #: Trajectory index of each point, shape (p,).
-    q: Floats  #: Weighted sum of squares at each point, shape (p,).
+    q: Floats  #: Weighted sum of squared residuals at each point, shape (p,).
     half_gradient: Floats  #: Half the gradient of `q` at each point, shape (p, 3).
     matrix: Floats  #: Normal matrices, shape (m, 3, 3).
     matrix_of: Indices  #: Index of each point's normal matrix, shape (p,).

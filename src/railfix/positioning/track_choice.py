@@ -58,18 +58,18 @@ class StandstillErrors(Settings):
 
     #: Standard deviation of a satellite's constant code error (multipath) at the zenith. It is divided by the sine of
     #: the elevation.
-    code_bias_m: float = option("Constant code error of a satellite at the zenith.", 0.6, metavar="M", gt=0)
+    code_bias_m: float = option("Sigma of a satellite's constant code error at the zenith.", 0.6, metavar="M", gt=0)
     #: Standard deviation of a satellite's varying code error at the zenith. It is divided by the sine of the elevation.
-    code_noise_m: float = option("Varying code error of a satellite at the zenith.", 0.5, metavar="M", gt=0)
+    code_noise_m: float = option("Sigma of a satellite's varying code error at the zenith.", 0.5, metavar="M", gt=0)
 
     correlation_s: float = option("Correlation time of the varying code error.", 60.0, metavar="S", gt=0)
     #: Standard deviation of a satellite's constant phase error at the zenith. It is divided by the sine of the
     #: elevation.
-    phase_bias_m: float = option("Constant phase error of a satellite at the zenith.", 0.005, metavar="M", gt=0)
+    phase_bias_m: float = option("Sigma of a satellite's constant phase error at the zenith.", 0.005, metavar="M", gt=0)
     #: Standard deviation per axis of each antenna's position on the train (antenna spacing, sway and lean).
     antenna_sigma_m: float = Field(default=0.05, gt=0)
     #: Standard deviation of the lateral map error common to all tracks of a yard, including antenna shifts due to cant.
-    map_sigma_m: float = option("Lateral error of the map, common to all mapped tracks.", 0.3, metavar="M", ge=0)
+    map_sigma_m: float = option("Sigma of the lateral map error common to all mapped tracks.", 0.3, metavar="M", ge=0)
 
     #: If None, the height is `ANTENNA_UP_M`; its standard deviation `ANTENNA_SIGMA_M` covers usual vehicles.
     antenna_up_m: float | None = option(
@@ -369,7 +369,7 @@ class _Places:
     log_evidence: Floats  #: Logarithm of the likelihood integrated along the track, shape (U,).
     expected_m: Floats  #: Most likely positions of the antennas, shape (U, A, 2).
     heading: Floats  #: Unit vectors along the track at the antennas, shape (A, 2).
-    misfit: float = np.inf  #: Distance of the code positions from the track, in sigmas.
+    misfit: float = np.inf  #: Distance of the code positions from the track, in standard deviations.
 
 
 def _places(

@@ -38,7 +38,7 @@ class TwoFrequencyLimits(Settings):
 
     #: Time constant of forgetting code differences. The error of the Klobuchar model changes over many minutes.
     window_s: float = Field(default=600.0, gt=0)
-    #: Epochs within this time count as one sample, because multipath errors at standstill are correlated.
+    #: Epochs within this time count together as one sample, because multipath errors at standstill are correlated.
     correlation_s: float = Field(default=60.0, gt=0)
     #: Standard deviation of the error of the difference between the broadcast group delays of two signals.
     delay_sigma_m: float = Field(default=0.2, gt=0)

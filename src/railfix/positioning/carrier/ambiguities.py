@@ -46,7 +46,7 @@ class PhaseLimits(Settings):
     passes: int = Field(default=2, ge=1)
     #: Ambiguities are fixed if the probability of a wrong integer is at most this. Fixing requires a base station.
     integer_risk: float = Field(default=1e-4, gt=0, lt=0.5)
-    #: Prior probability of non-integer phases (multipath, half cycles).
+    #: Prior probability that phase ambiguities are not integers (multipath, half cycles).
     no_integer_prior: float = Field(default=1e-2, gt=0, lt=1)
     #: Epochs with a noise sigma along the line above this have no position.
     largest_sigma_m: float = Field(default=1e3, gt=0)

@@ -66,7 +66,7 @@ class CycleSlipLimits(Settings):
     #: Part of the Doppler test limit that is proportional to the interval.
     doppler_mps: float = Field(default=0.05, gt=0)
     jerk_mps3: float = Field(default=0.5, gt=0)  #: Largest expected jerk; passenger trains have less.
-    #: Limit of the change of code minus phase. Used if there is no Doppler or its limit is larger than this one.
+    #: An arc ends if code minus phase changes by more than this. Tested without Doppler, or if its limit is larger.
     code_m: float = Field(default=10.0, gt=0)
 
 

@@ -186,8 +186,8 @@ def _ambiguities(
     """Return the corrections to the ambiguities' first values at each epoch, their covariances, arcs and memory.
 
     The shapes are (T, M, 3) and (T, M, M). The ambiguities are computed from the normal equations of the epoch and all
-    earlier epochs. Arcs and memory are those after the last epoch. If `held` is true, the mean of the ambiguities is
-    zero (`inverse_of_arcs`).
+    earlier epochs. Arcs and memory refer to the time after the last epoch. If `held` is true, the mean of the
+    ambiguities is zero (`inverse_of_arcs`).
     """
     count, row = len(memory.arc_id), np.arange(len(arc_id))[:, None]
     # channels without a phase are collected in an extra row and column
@@ -303,7 +303,7 @@ def _without(memory: Memory, ends: Masks) -> Memory:
 
 
 def _join(pieces: list[PhasePositions]) -> PhasePositions:
-    """Concatenate segments; `arcs` are those of the last segment."""
+    """Concatenate segments; `arcs` are the arcs of the last segment."""
     arrays: dict[str, Any] = {
         item.name: np.concatenate([getattr(p, item.name) for p in pieces])
         for item in fields(PhasePositions)
