@@ -34,7 +34,7 @@ _STEP_S: Final = 1.0  #: Time step of the numerical derivatives of satellite clo
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.
 _PASSES: Final = 3  #: Number of passes of outlier rejection. Each pass uses the noise scale of the previous fit.
 _TELLING: Final = 2.0  #: Normalised variances count as 1 unless they exceed 1 by more than this many sigmas.
-_FLOOR_MPS: Final = 0.02  #: Noise of a Doppler at high C/N0.
+_FLOOR_MPS: Final = 0.02  #: Standard deviation of a Doppler at high C/N0.
 
 
 class DopplerSpeedLimits(Settings):
@@ -59,7 +59,7 @@ class Dopplers(FrozenArrays):
     #: Satellite of each channel, shape (K,). At each epoch, only one channel of a satellite has values.
     satellite: Strings
     rate_mps: Floats  #: Range rate ``-lambda D``, positive for a receding satellite, shape (T, K); NaN if missing.
-    cn0_dbhz: Floats  #: Shape (T, K).
+    cn0_dbhz: Floats  #: C/N0, shape (T, K).
     sat_ecef_m: Floats  #: Satellite position at the time of transmission, shape (T, K, 3).
     earlier_ecef_m: Floats  #: Satellite position one second earlier, shape (T, K, 3).
     sat_velocity_mps: Floats  #: Satellite velocity at the time of transmission, ECEF, shape (T, K, 3).

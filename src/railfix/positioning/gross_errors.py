@@ -159,11 +159,11 @@ _FINE_M: Final = 12.5  #: Spacing of line points in the fine scan [m].
 _CLOCKS_APART_M: Final = 200.0
 #: A clock with one or two ranges is not used if it differs from the median clock by more than this [m].
 _CLOCK_AWAY_M: Final = 600.0
-#: Largest product of points, epochs and channels of a block.
+#: Largest product of the numbers of points, epochs and channels that are computed at once.
 _BLOCK: Final = 2_000_000
 #: The least cost is clear if all alternatives cost more by this fraction of `GROSS_M`.
 _CLEAR: Final = 0.7
-#: Minimum number of redundant ranges that agree with a point of the line.
+#: Gross errors are identified at a point of the line only if this many redundant ranges agree with it.
 _LEFT_ON_LINE: Final = 2
 
 

@@ -82,7 +82,7 @@ class Combined(NotebookTable):
     share: Floats  #: Weight of the second code, shape (T, K). The weight of the first code is 1 - `share`.
     ionosphere_m: Floats  #: Ionospheric delay on the first frequency minus modelled delay, shape (T, K).
     ionosphere_sigma_m: Floats  #: Standard deviation of `ionosphere_m`, shape (T, K).
-    difference_m: Floats  #: Code difference minus its prediction, shape (T, K).
+    difference_m: Floats  #: Second code minus first code minus predicted difference, shape (T, K).
     suspected: Masks  #: True for ranges whose `difference_m` exceeds its limit, shape (T, K).
 
 

@@ -37,7 +37,7 @@ class PhaseLimits(Settings):
     #: satellites move by hundredths of a radian bias the position by metres. With a code noise of 1 m at 1 Hz, the
     #: default averages over about 100 s. With 0, ambiguities are constant.
     drift_m: float = Field(default=0.01, ge=0)
-    hop_s: float = Field(default=10.0, gt=0)  #: Time step of the random walk.
+    hop_s: float = Field(default=10.0, gt=0)  #: Time step of the random walk of the ambiguities.
     #: Correlation time of code errors. Several epochs within this time are no more informative for ambiguities than
     #: one. The variance of the ambiguities is therefore multiplied by correlation time / interval, up to the variance
     #: from codes alone. Positions are unaffected. Use 0 for white noise, for example in simulations.

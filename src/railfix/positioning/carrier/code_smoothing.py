@@ -66,7 +66,7 @@ class CycleSlipLimits(Settings):
     #: Part of the Doppler test limit that is proportional to the interval.
     doppler_mps: float = Field(default=0.05, gt=0)
     jerk_mps3: float = Field(default=0.5, gt=0)  #: Largest expected jerk; passenger trains have less.
-    #: An arc ends if code minus phase changes by more than this. Tested without Doppler, or if its limit is larger.
+    #: An arc ends if code minus phase changes by more than this; tested unless the Doppler test has a smaller limit.
     code_m: float = Field(default=10.0, gt=0)
 
 
@@ -74,7 +74,7 @@ class CycleSlipLimits(Settings):
 class CycleSlipState:
     """State after a chunk: observations of the last epoch by channel ("G05", "1C"), and clock steps so far."""
 
-    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: NaT before the first epoch.
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Time of the last epoch, or NaT.
     channels: ChannelKeys = ()
     code_m: Floats = field(default_factory=lambda: np.empty(0))  #: Code, shape (M,).
     phase_m: Floats = field(default_factory=lambda: np.empty(0))  #: Phase before adding `step_ms`, shape (M,).
@@ -242,7 +242,7 @@ class SmoothingLimits(Settings):
 class SmoothingState:
     """State of the smoothing after a chunk, by channel."""
 
-    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: NaT before the first epoch.
+    time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Time of the last epoch, or NaT.
     channels: ChannelKeys = ()
     #: First value of code minus phase on the current arc, shape (M,); NaN without an arc.
     base_m: Floats = field(default_factory=lambda: np.empty(0))
