@@ -261,7 +261,7 @@ def test_positions_from_code_and_phase_have_no_level(recording: Recording) -> No
     config = recording.config(carrier="float")
     processor = make_processor(config, recording.navigation, {"front": recording.line})
     assert processor.process({"front": recording.observations[150:170]})[0].antennas["front"].protection is None
-    assert any("not available for positions from code and phase together" in note for note in processor.notes)
+    assert any("not available for positions from both code and phase" in note for note in processor.notes)
 
 
 @pytest.mark.requirement("C2", "C3")

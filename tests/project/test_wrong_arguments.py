@@ -152,7 +152,7 @@ def test_what_the_command_line_notes_is_a_warning_in_python_once(made: dict[str,
     moved = made["track"].latitude_deg + 0.002
     elsewhere = railfix.Track.from_geodetic(moved, made["track"].longitude_deg, made["track"].height_m)
     path = railfix.antenna_trajectory(elsewhere, made["vehicle"])
-    assert "front: most positions contradict the map; is this the track of the log?" in warned(lambda: run(path))
+    assert "front: most positions contradict the map; was the log recorded on this track?" in warned(lambda: run(path))
 
 
 @pytest.mark.slow

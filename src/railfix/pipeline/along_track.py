@@ -45,21 +45,21 @@ _WEIGHED_BY_FILTER: Final = (
 )
 #: Rejection reasons that apply to the code only; the filter still uses the satellite's phase and Doppler.
 _CODE_ALONE: Final = Reason.GROSS_ERROR
-#: The train is at standstill if the speed plus two sigmas is below this [m/s]: 1 km/h, the lower limit of tachometers.
+#: The train is at standstill if its speed plus two sigmas is below this [m/s]; tachometers measure from 1 km/h on.
 STANDSTILL_MPS: Final = 1.0 / 3.6
 #: Positions beyond an end of the line by at most this number of sigmas are moved to the end.
 _END_SIGMAS: Final = 4.0
 #: Positions beyond an end by at most this distance are moved to the end, whatever the sigma [m].
 _END_M: Final = 30.0
-#: Half-width of the gate of two-way ranges around the predicted range, in standard deviations.
+#: A two-way range is used if it differs from the predicted range by at most this number of standard deviations.
 _GATE_SIGMAS: Final = 3.0
-#: Minimum half-width of the gate towards long ranges [m]. Echoes delayed by over 0.3 m can be separated (P2, table 3).
+#: Two-way ranges longer than predicted by up to this are also used [m]. Echoes over 0.3 m longer are separable (P2).
 _LATE_M: Final = 0.6
 #: Vertical error of the ionospheric model that the filter's constants `slow_code_m` and `TILT_M` assume [m].
 _QUIET_IONOSPHERE_M: Final = 1.0
-#: Length of the blocks of GPS time that the filter processes if there are sensors [ns].
+#: With sensors, the filter processes epochs in blocks of this length of GPS time [ns].
 _BLOCK_NS: Final = 5_000_000_000
-#: Ratio of the speed to its sigma above which a direction is reported.
+#: The direction of motion is reported if the speed exceeds this number of its sigmas.
 _DIRECTION_SIGMAS: Final = 3.0
 
 
@@ -104,7 +104,7 @@ def along_track(
             sure = np.where(is_bounded(tracked.status), tracked.sigma_m, np.nan)
             of_filter, filter_wheel = _against_wheel(replays, tracked.arc_m, sure, after.filter_wheel, config)
             after, tracked = replace(after, filter_wheel=filter_wheel), _bound_by_wheel(tracked, of_filter.bound_m)
-        # spoofing outranks a doubt without a named cause; a time-tag error outranks both
+        # spoofing replaces a doubt of unknown cause; a time-tag error replaces both
         unnamed = (tracked.status == TrackStatus.DOUBTFUL) & (single.suspicion != Suspicion.TIME_TAGS)
         parted = wheel.parted & (is_bounded(tracked.status) | unnamed)
         tracked = mark_doubtful(tracked, parted, TrackStatus.SPOOFING_SUSPECTED)
@@ -133,7 +133,7 @@ def single_epochs(solution: Solution, interference: Interference | None, config:
 
 
 def _bound_by_wheel(tracked: Tracked, bound_m: Floats) -> Tracked:
-    """Raise finite levels to at least `bound_m`, the largest position error that wheel distances would not reveal."""
+    """Raise finite protection levels to at least `bound_m`, the largest error that wheel distances cannot reveal."""
     levels = {name: np.asarray(getattr(tracked, name)) for name in ("level_m", "ground_level_m", "amount_m")}
     return replace(
         tracked, **{n: np.where(np.isfinite(level), np.fmax(level, bound_m), level) for n, level in levels.items()}
@@ -178,7 +178,7 @@ def with_passings(
     samples: SensorSamples | None,
     limits: BaliseLimits,
 ) -> tuple[AlongTrack, FilterState]:
-    """Return the positions with the passings of balises, and the state; the statuses in `result` must be final."""
+    """Return `result`, which must have its final statuses, with the passings of balises; also return the new state."""
     if listed is None:
         return result, state
     readings = samples.balises if samples else BaliseReadings()
@@ -210,8 +210,8 @@ def _run_filter(
 
     `single` has single-epoch arc lengths and their standard deviations, shape (T,) each [m].
 
-    With sensors, the epochs are processed in blocks of `_BLOCK_NS` of GPS time, whatever the chunks. At the start of
-    each block, the dead-reckoned position, at which the map's gradient is read, is set to the filter's position.
+    With sensors, the epochs are processed in blocks of `_BLOCK_NS` of GPS time, wherever chunks begin. At the start of
+    each block, dead reckoning, whose position determines the map's gradient, restarts from the filter's position.
     """
 
     def sine_at(arc_m: Floats) -> Floats:
@@ -274,10 +274,10 @@ def _gate(
 
 
 def _gated_ranges(ranges: RangeEpochs, time: Datetimes, line: Line, state: FilterState, config: Config) -> RangeEpochs:
-    """Return the two-way ranges; NaN if there is no filter position, or a range is inconsistent with it (P2 3.3).
+    """Return two-way ranges; a range is NaN if it contradicts the filter's position, or if there is none (P2 3.3).
 
     The gate rejects echoes and ranges to wrongly surveyed units. The position is predicted from the start of the block
-    with constant speed; a possible acceleration widens the gate with the square of the elapsed time.
+    with constant speed; to allow for acceleration, the gate widens with the square of the elapsed time.
     """
     fixed = state.anchor
     if fixed is None:
@@ -300,7 +300,7 @@ def _block(time: np.datetime64) -> int:
 
 
 def _restart_state(state: FilterState, fixed: FilterFix) -> FilterState:
-    """Return the state at the start of a block, where dead reckoning restarts from the filter's position."""
+    """Return the state for a new block, with dead reckoning restarted from the filter's position."""
     sensors = state.sensors
     if sensors.motion.tick:
         motion = replace(sensors.motion, arc_m=fixed.arc_at(sensors.motion.time), sigma_m=fixed.sigma_m)
@@ -337,8 +337,8 @@ def gnss_epochs(
 ) -> tuple[GnssEpochs, CycleSlipState | None]:
     """Return the filter's measurements, and the state of the slip detection.
 
-    A code is the corrected pseudorange, NaN at unsure epochs and where it has a rejection reason outside
-    `_WEIGHED_BY_FILTER`. Its standard deviation is the range sigma times `noise_scale`, shape (T,).
+    A code is the corrected pseudorange. It is NaN if the epoch is `unsure`, or if the code has a rejection reason
+    outside `_WEIGHED_BY_FILTER`. Its standard deviation is the range sigma times `noise_scale`, shape (T,).
 
     Carrier phases are corrected for satellite clock and troposphere. Dopplers are not corrected, because the drift of a
     satellite clock and the tropospheric rate are only some millimetres per second.
@@ -371,9 +371,9 @@ def gnss_epochs(
 def compute_tilt_scale(ranges: CorrectedRanges, line: Line, klobuchar: Floats | None, config: Config) -> Floats:
     """Return `GnssEpochs.tilt_scale`, shape (T,).
 
-    The scale is 0 for ionosphere-free codes, and 1 where SBAS or a base station corrects the ranges or no model is
-    used. Otherwise it is the error of the Klobuchar model in metres, at least 1. This error is the fraction
-    `NominalErrors.ionosphere_share` of the vertical delay at the beginning of the line, for any satellites in view.
+    The scale is 0 for ionosphere-free codes. It is 1 if SBAS or a base station corrects the ranges, or if there is no
+    ionospheric model. Otherwise it is the larger of 1 and the error of the Klobuchar model in metres:
+    `NominalErrors.ionosphere_share` times the vertical delay at the beginning of the line.
     """
     one = np.ones(len(ranges.time))
     if klobuchar is None or config.dual_frequency_sbas:

@@ -20,7 +20,7 @@ from railfix.track.trajectory import Trajectory
 #: Length of a stretch of the line [m]. The pairs of positions on one stretch count as one sample, because the same
 #: reflections affect all of them.
 _STRETCH_M: Final = 50.0
-#: Minimum number of stretches for a verdict; a train at rest is on too few stretches.
+#: The order is judged only with pairs on at least this number of stretches, so not while the train is at rest.
 _LEAST_STRETCHES: Final = 4
 #: The antennas are in the wrong order if the front antenna is behind the rear antenna by more than this number of
 #: sigmas.
@@ -46,14 +46,14 @@ class AntennaOrder:
         apart = float(np.median(front.chainage_at(arcs[0]) - rear.chainage_at(arcs[1])))
         self._facing = front.front_sign
         self.distance_m = self._facing * rising
-        self._reference_m = apart - rising  # both chainages may refer to the same point of the vehicle
+        self._reference_m = apart - rising  # nonzero if both chainages refer to the same point of the vehicle
         self._tolerance_s = tolerance_s
         #: For each stretch: number of pairs, sum of distances [m], sum of variances [m^2].
         self._stretches: dict[int, tuple[float, float, float]] = {}
 
     @classmethod
     def between(cls, trajectories: Mapping[str, Trajectory], *, tolerance_s: float) -> AntennaOrder | None:
-        """Return a new test; None unless `trajectories` has the paths of two antennas of one vehicle."""
+        """Return a new test, or None if `trajectories` lacks the paths of two antennas of one vehicle."""
         if len(trajectories) < 2 or any(t.body_chainage_m is None for t in trajectories.values()):
             return None
         return cls(trajectories["front"], trajectories["rear"], tolerance_s=tolerance_s)
@@ -61,8 +61,8 @@ class AntennaOrder:
     def add(self, front: tuple[Datetimes, ArrayLike, ArrayLike], rear: tuple[Datetimes, ArrayLike, ArrayLike]) -> bool:
         """Add the positions of more epochs; return whether any of them is on a new stretch.
 
-        `front` and `rear` have time tags, chainages [m] and sigmas [m], shape (F,) and (R,) each; NaN without a
-        position.
+        `front` has time tags, chainages [m] and sigmas [m], shape (F,) each, NaN without a position; `rear` has the
+        same values, shape (R,) each.
         """
         at_front, at_rear = pair_epochs(front[0], rear[0], tolerance_s=self._tolerance_s)
         (place, other), (sigma, other_sigma) = (
@@ -110,6 +110,6 @@ class AntennaOrder:
         first, second = ("front", "rear") if self.distance_m > 0.0 else ("rear", "front")
         return (
             f"according to the vehicle file, the positions of the {first} log should be {right:.1f} m ahead of those "
-            f"of the {second} log, but they are {-ahead:.1f} m (sigma {sigma:.1f} m) behind: the logs are swapped "
-            "(--front, --rear), or the vehicle faces the other way (facing)"
+            f"of the {second} log, but they are {-ahead:.1f} m (sigma {sigma:.1f} m) behind; either the logs are "
+            "swapped (--front, --rear), or the vehicle faces the other way (facing)"
         )

@@ -22,7 +22,7 @@ from railfix.track.passes import short_distance_m
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import BaliseEpochs, Tracked
 
-#: Readings of the same identity within this time belong to one passing [s]; a train at rest repeats its reading.
+#: Readings of one balise within this time belong to one passing [s]; a train at rest repeats its reading.
 AGAIN_S: Final = 60.0
 
 
@@ -31,8 +31,8 @@ class BaliseLimits(Settings):
 
     #: Distance of the reader ahead of the vehicle's middle, or ahead of the antenna if there is no vehicle file.
     ahead_m: float = 0.0
-    #: Minimum standard deviation of a reading along the line: SUBSET-036 requires 1 m for the vital use of a balise's
-    #: position.
+    #: Minimum standard deviation, along the line, of the position from a balise reading: SUBSET-036 requires 1 m for
+    #: safety-related use.
     sigma_m: float = Field(default=1.0, gt=0)
 
 
@@ -40,9 +40,9 @@ class BaliseLimits(Settings):
 class BaliseState:
     """Last balise read before a chunk."""
 
-    balise: str = ""  #: Identity; blank before the first reading.
+    balise: str = ""  #: Identity of the balise; blank before the first.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    turn: int = 1  #: Column of the balise in `railfix.tracking.BaliseEpochs`.
+    turn: int = 1  #: Column (0 or 1) of the balise in `railfix.tracking.BaliseEpochs`.
 
 
 def arcs_of_balises(listed: ListedBalises, trajectory: Trajectory, limits: BaliseLimits) -> Floats:
@@ -63,8 +63,8 @@ def balise_epochs(
     """Assign each reading to the next epoch; return the measured balise positions, and the state for the next chunk.
 
     Unlisted balises and readings repeated within `AGAIN_S` are left out. Successive balises alternate between two
-    columns. Each column is omitted by one sub-filter, so that a wrong balise does not affect that sub-filter. `edges`
-    has the epoch before the chunk and the epochs of the chunk, shape (T + 1,).
+    columns. Each column is left out by one sub-filter, which a wrong balise in this column does not affect. `edges` has
+    the epoch before the chunk and the epochs of the chunk, shape (T + 1,).
     """
     found = BaliseEpochs.none(len(edges) - 1)
     index, arc = listed.find_index(readings.balise), arcs_of_balises(listed, trajectory, limits)
@@ -88,12 +88,12 @@ VIRTUAL, READ, MISSING, CONTRADICTS, NOT_LISTED = range(5)
 VERDICTS: Final = ("virtual", "read", "missing", "contradicts", "not_listed")
 #: Odometer accuracy by SUBSET-041 5.2.1.1: a constant [m], plus a fraction of the distance since the last balise read.
 ODOMETER_M, ODOMETER_SHARE = 5.0, 0.05
-#: Longest time between epochs for interpolation, and between a reading and the passing of its balise [s].
+#: Longest interval over which a passing is interpolated, or a reading is assigned to an epoch or a passing [s].
 _APART_S: Final = 2.0
-#: A reading is wrong if the balise and the filter's position differ by more than this number of sigmas.
+#: A reading is wrong if the positions of balise and filter differ by more than this number of sigmas of the difference.
 _CONTRADICTION_SIGMAS: Final = 5.0
 _NEVER: Final = np.datetime64("NaT", "ns")
-#: Values of the filter that are used at each epoch (fields of `Tracked`).
+#: Fields of `railfix.tracking.Tracked` that the search for passings uses at each epoch.
 _VALUES: Final = ("arc_m", "speed_mps", "sigma_m", "level_m", "amount_m")
 
 
@@ -107,33 +107,33 @@ class Passing:
     verdict: int
     chainage_m: float  #: Listed chainage; NaN if unlisted.
     time: np.datetime64  #: Time of the passing according to the filter; time of the reading if the reading is wrong.
-    earliest: np.datetime64 = _NEVER  #: Start of the interval of the passing; NaT for a wrong reading.
-    latest: np.datetime64 = _NEVER  #: End of the interval of the passing; NaT for a wrong reading.
+    earliest: np.datetime64 = _NEVER  #: Earliest possible time of the passing; NaT for a wrong reading.
+    latest: np.datetime64 = _NEVER  #: Latest possible time of the passing; NaT for a wrong reading.
     read: np.datetime64 = _NEVER  #: Time of the reading; NaT without a reading.
-    read_error_m: float = float("nan")  #: Position of the balise minus the filter's position at the reading.
+    read_error_m: float = float("nan")  #: Balise position minus filter position at the reading.
     here: str = ""  #: For a contradicting reading, the listed balise nearest to the filter's position.
     speed_mps: float = float("nan")  #: Speed at the passing or reading.
-    sigma_m: float = float("nan")  #: Standard deviation of the filter's position at that time.
-    level_m: float = float("nan")  #: Protection level of the filter's position at that time.
-    amount_m: float = float("nan")  #: Over- and under-reading amount of the filter's position at that time.
-    odometer_m: float = float("nan")  #: Odometer accuracy by SUBSET-041 since the previous balise.
+    sigma_m: float = float("nan")  #: Standard deviation of the filter's position at `time`.
+    level_m: float = float("nan")  #: Protection level of the filter's position at `time`.
+    amount_m: float = float("nan")  #: Over- and under-reading amount of the filter's position at `time`.
+    odometer_m: float = float("nan")  #: Odometer accuracy by SUBSET-041, for a reset at the last balise.
 
 
 @dataclass(frozen=True, kw_only=True)
 class PassingState:
-    """State of the search for passings after a chunk; M balises and virtual balises."""
+    """State of the search for passings after a chunk, for M balises and virtual balises."""
 
-    time: Datetimes  #: Time of the last epoch with a position; shape (1,), or (0,) without an epoch.
-    values: Floats  #: `_VALUES` of the last epoch with a position; shape (1, 5) or (0, 5).
+    time: Datetimes  #: Time of the last epoch with a position; shape (1,), or (0,) without one.
+    values: Floats  #: `_VALUES` at the last epoch with a position; shape (1, 5), or (0, 5) without one.
     #: Side of each balise on which the train was last known to be: -1 before it, 1 beyond it, 0 unknown; shape (M,).
     side: Integers
     since: Datetimes  #: Time at which the train left the side given in `side`, shape (M,).
     over: Datetimes  #: Time at which the filter's position was last over the balise, shape (M,).
-    over_values: Floats  #: `_VALUES` at the time `over`, and odometer accuracy; shape (M, 6).
+    over_values: Floats  #: `_VALUES` and odometer accuracy at the time `over`; shape (M, 6).
     read: Datetimes  #: Time of the last correct reading of each balise, shape (M,).
-    #: Readings after the last epoch, which are compared with the filter's positions in the next chunk.
+    #: Readings that are later than the last epoch; they are compared with the filter's positions in the next chunk.
     waiting: BaliseReadings = field(default_factory=BaliseReadings)
-    #: Time and filter position [m] of the correct readings of the last `_APART_S`, and of the last one before these.
+    #: Time and filter position [m] at each correct reading of the last `_APART_S` and at the preceding correct reading.
     right: tuple[tuple[np.datetime64, float], ...] = ()
 
     @classmethod
@@ -218,7 +218,7 @@ def _judge(
 
 
 def _odometer(place_m: float, time: np.datetime64, right: Sequence[tuple[np.datetime64, float]]) -> float:
-    """Return the accuracy [m] of an odometer that was reset at the last correct balise reading; NaN without one."""
+    """Return the accuracy [m] of an odometer reset at the last correct balise reading, NaN before the first."""
     before = [place for at, place in right if seconds(time - at) > _APART_S]
     return ODOMETER_M + ODOMETER_SHARE * abs(place_m - before[-1]) if before else float("nan")
 
@@ -289,8 +289,8 @@ def balise_notes(antenna: str, passings: Iterable[Passing]) -> list[str]:
             which = f", next to {passing.here}" if passing.here and passing.here != passing.balise else ""
             notes.append(
                 f"{name}, read at {at}, contradicts the filter: it is listed at {passing.chainage_m:.1f} m, but the "
-                f"train was {abs(passing.read_error_m):.1f} m from there (sigma {passing.sigma_m:.1f} m){which}; the "
-                "identity of the balise, or its position in the list, is wrong"
+                f"train was {abs(passing.read_error_m):.1f} m from that point (sigma {passing.sigma_m:.1f} m){which}; "
+                "the identity of the balise, or its position in the list, is wrong"
             )
         elif passing.verdict == NOT_LISTED:
             notes.append(f"{name}, read at {at}, is not listed on this line; the reading is not used")

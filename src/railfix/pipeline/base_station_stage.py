@@ -1,4 +1,4 @@
-"""Range errors of a base station, from observations that are corrected like those of the train."""
+"""Range errors of a base station, whose observations are corrected in the same way as the train's observations."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from railfix.ranges.base_station import LONGEST_AGE_S, BaseErrors
 from railfix.track import Track
 from railfix.track.trajectory import Trajectory
 
-#: Half length of the artificial north-south track through the station that the corrections require [deg]: about 50 m.
+#: Half length of an artificial north-south track through the station, needed for the corrections [deg]: about 50 m.
 _HALF_LINE_DEG: Final = 0.0005
 _NO_EPOCH: Final = "base station: no epoch with a known station position so far, so no errors are subtracted"
-#: Station positions within this distance count as equal [m].
+#: The state is reset if the station's position changes by more than this [m].
 _SAME_PLACE_M: Final = 0.01
 
 
@@ -48,14 +48,14 @@ class Stations(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class BaseState:
-    """Range errors of a base station so far (None before the first), and state of its carrier-phase stages."""
+    """Range errors of a base station (None before its first epoch), and state of its carrier-phase stages."""
 
     errors: BaseErrors | None = None
     carrier: CarrierState = field(default_factory=CarrierState)
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """One note if no epoch with a known station position has been received so far; otherwise empty."""
+        """One note until an epoch with a known station position has been received, then none."""
         return () if self.errors is not None else (_NO_EPOCH,)
 
     def beside(self, received: Received) -> Received:
@@ -67,7 +67,7 @@ class BaseState:
 class BaseStation:
     """Base station at a known ECEF position, shape (3,) [m], in the reference frame of the satellite orbits.
 
-    The station's pseudoranges are corrected like those of the train, and smoothed by carrier phase where available.
+    The station's pseudoranges are corrected like the train's pseudoranges, and smoothed by any available carrier phase.
     Smoothing reduces the station's noise, but not its multipath. If the position is "stream", it is read from the
     headers of the observations. The state is reset if this position changes by more than a centimetre, for example if
     the virtual station changes.
@@ -87,7 +87,7 @@ class BaseStation:
     def add_observations(
         self, obs: Observations | None, received: Received, state: BaseState | None, began: np.datetime64
     ) -> BaseState:
-        """Add observations of the station to the state; drop range errors that are too old for epochs after `began`."""
+        """Add observations of the station to the state; drop range errors too old for use at epochs from `began` on."""
         state = state or BaseState()
         if obs is not None and len(obs):
             place = obs.header.approximate_ecef_m if self._ecef_m is None else self._ecef_m
@@ -154,6 +154,6 @@ class BaseStation:
 def check_base(config: Config, base: BaseStation | None) -> None:
     """Raise SettingsError if the settings require a base station and none is given, or do not allow the given one."""
     if config.carrier == "fixed" and base is None:
-        raise SettingsError("carrier = fixed: integers require a base station (--base); otherwise set carrier = float")
+        raise SettingsError("carrier = fixed requires a base station (--base); without one, set carrier = float")
     if config.sbas and base is not None:
         raise SettingsError("both SBAS and a base station correct the ranges; use only one of the two")

@@ -39,7 +39,7 @@ from railfix.positioning.two_frequencies import Combined
 from railfix.ranges.corrected import CorrectedRanges
 from railfix.track.trajectory import Trajectory
 
-#: Elevation below which the weights of phases are constant [deg].
+#: Phases below this elevation have the same weight as phases at this elevation [deg].
 LOWEST_WEIGHTED_DEG = 5.0
 
 
@@ -80,7 +80,7 @@ def smooth_ranges(
     config: Config,
     states: Sequence[CarrierState],
 ) -> tuple[CorrectedRanges, list[CarrierState]]:
-    """Return ranges that have smoothed codes and the weights of raw codes, and the new state of each antenna.
+    """Return ranges with smoothed codes, but with the weights of raw codes; also return each antenna's new state.
 
     Smoothing does not raise the weights, because multipath and the error floor do not average out like white noise.
     """
@@ -112,7 +112,7 @@ def code_and_phase(
     config: Config,
     state: CarrierState,
 ) -> tuple[PhasePositions, CarrierState]:
-    """Return positions from code and phase of this and earlier epochs, and the new state (requirement A5; P4).
+    """Return each epoch's position from codes and phases up to the epoch, and the new state (requirement A5; P4).
 
     A phase is used if the code of the same channel is used. `slips` covers all channels of the observations; `arc_m`
     has positions from codes only, shape (T,).
@@ -152,7 +152,7 @@ def code_and_phase(
 
 
 def _base_slips(corrected: CorrectedRanges, state: CarrierState) -> tuple[Masks, dict[tuple[str, str], int]]:
-    """Return a mask (T, K) of epochs at which a phase arc of the base station starts, and the last arcs."""
+    """Return a mask (T, K) of starts of the base station's phase arcs, and the number of each channel's last arc."""
     assert corrected.base is not None
     keys = list(zip(corrected.satellite.tolist(), corrected.signal.tolist(), strict=True))
     before = np.array([state.base_arc.get(key, -1) for key in keys], dtype=np.int64)
@@ -163,9 +163,9 @@ def _base_slips(corrected: CorrectedRanges, state: CarrierState) -> tuple[Masks,
 def _lasting(
     corrected: CorrectedRanges, ranges: Ranges, phases: Phases, limits: PhaseLimits, state: CarrierState
 ) -> tuple[Ranges, Phases]:
-    """Return ranges and phases with weights reduced because multipath persists for `PhaseLimits.correlation_s`.
+    """Reduce the weights of ranges and phases, to allow for multipath that persists for `PhaseLimits.correlation_s`.
 
-    The first epoch of an arc has full weight, so that the factors in an arc add up to its number of independent epochs.
+    The first epoch of an arc has full weight, so that the arc's weight factors sum to its number of independent epochs.
     """
     before = last_arcs(corrected.satellite, corrected.signal, state.arcs)
     latest = np.maximum.accumulate(np.concatenate([before[None], phases.arc_id]))

@@ -28,12 +28,12 @@ def missing_notes(received: Received, config: Config, second: SecondCodes | None
     return tuple(notes)
 
 
-#: Largest number of cached sets of channels.
+#: Largest number of sets of observed channels whose selection is cached.
 _REMEMBERED: Final = 64
 
 
 class ChannelBook:
-    """Channels of observations that a configuration selects, computed once for each set of observed channels."""
+    """Observed channels that a configuration selects; the selection is cached for each set of observed channels."""
 
     def __init__(self, config: Config) -> None:
         signals: Mapping[str, Sequence[str]] = config.signals

@@ -22,17 +22,17 @@ class Chunk:
 
     names: tuple[str, ...]  #: Names of the antennas.
     antennas: AntennaRows  #: Trajectories and rows of the antennas.
-    corrected: CorrectedRanges  #: Corrected ranges with the verdicts so far.
-    pair: PairedEpochs | None  #: Common epochs of two antennas of one vehicle.
+    corrected: CorrectedRanges  #: Corrected ranges with the rejection reasons so far.
+    pair: PairedEpochs | None  #: Common epochs of two antennas of one vehicle; None without two.
     sensors: SensorSamples | None  #: On-board sensor samples since the previous chunk.
     notes: tuple[str, ...]
     #: Ionospheric coefficients in use, shape (8,); None if the ionosphere is uncorrected, or corrected by SBAS.
     klobuchar: Floats | None = None
-    screens: Mapping[str, Screened] = field(default_factory=dict)  #: Metric and verdict of each observation screen.
-    combined: Combined | None = None  #: Combination of the codes of two frequencies.
+    screens: Mapping[str, Screened] = field(default_factory=dict)  #: Metrics and verdicts by observation screen.
+    combined: Combined | None = None  #: Combined codes of two frequencies; None with one frequency.
     slips: Slips | None = None  #: Cycle slips of all channels of the observations, if the carrier phase is used.
     solution: Solution | None = None  #: Positions of single epochs.
-    interference: Sequence[Interference | None] = ()  #: Single-epoch interference result of each antenna.
+    interference: Sequence[Interference | None] = ()  #: Signs of interference at each antenna; None if unchecked.
     #: Verdicts of the position screens, by antenna and screen.
     judged: Mapping[str, Mapping[str, Screened]] = field(default_factory=dict)
 

@@ -86,7 +86,7 @@ PRESETS: Final[Mapping[str, Mapping[str, Any]]] = {
 if TYPE_CHECKING:
 
     class ScreenSettings(Settings):
-        """Limits of the screens; at run time, there is one field for every screen in `SCREENS`."""
+        """Limits of the screens; the fields, one for each screen in `SCREENS`, are created at run time."""
 
         elevation: ElevationLimits = ElevationLimits()
         cn0: Cn0Limits = Cn0Limits()
@@ -99,7 +99,7 @@ else:
         "ScreenSettings", __base__=Settings, **{screen.name: (type(screen.limits), screen.limits) for screen in SCREENS}
     )
 
-#: Time off the map after which the filter drops its position, and time on the map after which it restarts [s]. On the
+#: The filter drops its position after this time off the map, and restarts after the same time on the map [s]. On the
 #: recordings, with a correct map, no two consecutive positions are off the map.
 OFF_MAP_S: Final = 10.0
 
@@ -113,72 +113,72 @@ class Config(ScreenSettings):
         Limits of the screens.
     """
 
-    #: Base preset; other settings override it. "p1" is table 6 of P1: elevation mask 20 deg, C/N0 floor 30 dB-Hz and 10
-    #: dB-Hz below the curve, Doppler 1.5 m (no hold), antenna pair 5 m with one clock for both receivers (P1 2.3(3)),
-    #: RAIM with two satellites and 100 m^2, antenna spacing 5 m, positions with failed checks dropped. Settings that P1
+    #: Base preset; other settings override it. "p1" is table 6 of P1: elevation mask 20 deg; C/N0 from 30 dB-Hz, at
+    #: most 10 dB below the curve; Doppler limit 1.5 m, no hold; antenna pair 5 m, one clock for both receivers (P1
+    #: 2.3(3)); RAIM 100 m^2, two exclusions; antenna spacing 5 m; no positions with failed checks. Settings that P1
     #: does not specify (weights, noise, inter-system biases, ambiguous sections) are as in "default".
     preset: Literal["default", "strict", "p1"] = "default"
     #: Constellations used. GLONASS is left out by default, because code biases between its channels reach metres.
     systems: tuple[Literal["G", "J", "E", "C", "R"], ...] = ("G", "J", "E", "C")
-    #: Satellites ("G07") and constellations ("C") that are not used.
+    #: Satellites (such as "G07") and constellations (such as "C") that are not used.
     exclude: tuple[Annotated[str, Field(pattern=r"^[GJECR]([0-9]{2})?$")], ...] = ()
     #: Signals of each constellation in order of preference; the first observed signal is used.
     signals: dict[str, tuple[str, ...]] = Field(default_factory=lambda: dict(DEFAULT_SIGNALS))
-    #: Number of codes combined per satellite; always one with SBAS on L1 or a base station.
+    #: Number of frequencies whose codes are used per satellite; always one with SBAS on L1 or a base station.
     frequencies: Literal["one", "two"] = "one"
-    two_frequencies: TwoFrequencyLimits = TwoFrequencyLimits()  #: Limits of the combination of two codes.
-    #: Active screens; health and validity of the satellites are always checked.
+    two_frequencies: TwoFrequencyLimits = TwoFrequencyLimits()  #: Limits of the combination of a satellite's two codes.
+    #: Names of the active screens. Satellite health and record validity are always checked.
     screens: tuple[str, ...] = SCREEN_NAMES
-    #: File with the mean C/N0 by elevation, written by ``railfix cn0-curve``. Without a file, only the floor applies.
+    #: File with the mean C/N0 by elevation, written by ``railfix cn0-curve``. Without it, only the C/N0 floor applies.
     cn0_curve: Path | None = None
-    #: Whether the coordinates of positions with a failed check (`reasons.CHECK_FAILED`) are kept, with the status of
-    #: the check, or dropped as in P1.
+    #: Treatment of positions with a failed check (`reasons.CHECK_FAILED`): "keep" sets the status of the check; "drop"
+    #: also removes the coordinates, as in P1.
     failed_checks: Literal["keep", "drop"] = "keep"
-    #: Availability/accuracy threshold: a position whose single-epoch sigma (`Solution.epoch_sigma_m`) exceeds this
-    #: limit is `uncertain`, a failed check. With ``carrier`` "float" or "fixed", the sigma of the published position is
-    #: compared instead. P4 accepts a car length, 20 m; the preset "strict" uses 10 m and drops failed checks.
+    #: A position whose single-epoch sigma (`Solution.epoch_sigma_m`) exceeds this limit gets the status `uncertain`,
+    #: which counts as a failed check. With ``carrier`` "float" or "fixed", the limit applies to the sigma of the
+    #: published position. P4 accepts a car length, 20 m; the preset "strict" uses 10 m and drops failed checks.
     largest_sigma_m: float = Field(default=20.0, gt=0)
-    #: Minimum number of satellites for a position. P1 3.2 uses 3; with 2, positions on curves are ambiguous.
+    #: Minimum number of satellites for a position. P1 3.2 uses 3; with 2, positions in curves are ambiguous.
     min_satellites: int = Field(default=3, ge=2)
-    dilution_limit: float = Field(default=20.0, gt=0)  #: Largest along-track dilution [m/m] of a position.
-    #: Probability that noise alone makes a position count as off the map. The noise is estimated from the residuals of
-    #: the 3-D fit.
+    dilution_limit: float = Field(default=20.0, gt=0)  #: No position if the along-track dilution [m/m] exceeds this.
+    #: Probability that a position on the map counts as off the map because of noise. The noise is estimated from the
+    #: residuals of the 3-D fit.
     off_map_risk: float = Field(default=1e-6, gt=0, lt=1)
-    #: Largest probability that the train is on another track. Above it, positions on a network are neither `ok` nor
-    #: `tracking`, and have no protection level. `railfix which-track` uses the same limit.
+    #: Largest acceptable probability that the train is not on the reported track. Above this limit, positions on a
+    #: network are neither `ok` nor `tracking`, and have no protection level. `railfix which-track` uses the same limit.
     track_risk: float = Field(default=1e-3, gt=0, lt=1)
     ionosphere: Literal["klobuchar", "off"] = "klobuchar"  #: Model of the ionospheric delay.
     troposphere: Literal["saastamoinen", "off"] = "saastamoinen"  #: Model of the tropospheric delay.
-    #: Largest age of a navigation record; older records are not used, even if they are valid.
+    #: Navigation records older than this are not used, even if they are valid; by default, valid records are used.
     max_ephemeris_age_s: float | None = Field(default=None, gt=0)
-    #: Standard deviations of the map, in place of those in the track file (P1: 0.30 m in plan, 0.60 m in height).
+    #: Standard deviations of the map, instead of the values in the track file (P1: 0.30 m in plan, 0.60 m in height).
     map_plan_sigma_m: float | None = Field(default=None, gt=0)
     map_height_sigma_m: float | None = Field(default=None, gt=0)
     noise_scale: NoiseScaleLimits = NoiseScaleLimits()  #: Estimation of the receiver's noise from the residuals.
-    #: Test for persistent range errors of a minute and longer.
+    #: Test for range errors that persist for a minute or longer.
     lasting_errors: LastingErrorLimits = LastingErrorLimits()
-    #: Selection of an epoch's consistent ranges, from which inter-system biases and noise are estimated.
+    #: Selection of an epoch's consistent ranges; inter-system biases and noise are estimated from these ranges.
     robust_fit: RobustFitLimits = RobustFitLimits()
-    map_offset: MapOffsetLimits = MapOffsetLimits()  #: Test of the map against the 3-D positions of the last minutes.
-    interference: InterferenceLimits = InterferenceLimits()  #: Signs of jamming and spoofing.
-    noise: CodeNoise = CodeNoise()  #: Range sigmas, which determine the weights.
+    map_offset: MapOffsetLimits = MapOffsetLimits()  #: Test of the map with 3-D positions of the last minutes.
+    interference: InterferenceLimits = InterferenceLimits()  #: Detection of jamming and spoofing.
+    noise: CodeNoise = CodeNoise()  #: Model of the range sigmas, which determine the weights.
     #: Files of SBAS messages, or "stream" for messages that the receivers pass on; empty if SBAS is not used. SBAS
     #: corrections replace the models, and satellites without a valid correction are rejected.
     sbas: tuple[Path, ...] | Literal["stream"] = ()
-    #: Messages to use: L1 messages correct GPS L1 C/A; L5 messages (dual-frequency) correct the ionosphere-free codes
-    #: of GPS L1 C/A and L5, and of Galileo E1 and E5a. With L5, satellites without both codes are rejected.
+    #: SBAS messages to use: L1 messages correct GPS L1 C/A; L5 messages (dual-frequency) correct the ionosphere-free
+    #: codes of GPS L1 C/A and L5, and of Galileo E1 and E5a. With L5, satellites without both codes are rejected.
     sbas_band: Literal["L1", "L5"] = "L1"
-    #: GEO whose messages are used; "best" is the GEO with the most usable corrections (on L1: fast corrections).
+    #: PRN of the GEO whose messages are used; "best" is the GEO with the most usable (on L1: fast) corrections.
     sbas_prn: int | Literal["best"] = "best"
     #: SBAS time-outs, use of message type 0, and treatment of missing degradation data.
     sbas_limits: SbasLimits = SbasLimits()
     base: BaseLimits = BaseLimits()  #: Limits of the corrections by a base station.
     #: File with overbounds of the range errors by direction and C/N0, written by ``railfix error-model``. For the
     #: protection level, each range sigma is raised at least to the sigma of the overbound. Weights, screens and RAIM
-    #: use `noise` alone. Without the file, the protection level uses `noise` times the noise scale estimated so far,
-    #: which does not bound the tails.
+    #: use `noise` alone. Without the file, the protection level uses `noise` times the noise scale estimated so far;
+    #: this product does not bound the tails of the errors.
     error_model: Path | None = None
-    #: Satellite and atmospheric errors. Without SBAS, they are added to an error model of local errors.
+    #: Satellite and atmospheric errors. Without SBAS, they are added to the local errors of `error_model`.
     nominal: NominalErrors = NominalErrors()
     protection: Literal["on", "off"] = "on"  #: Computation of the along-track protection level.
     #: Integrity risk per hour, its allocation, and the assumed fault probabilities.
@@ -187,7 +187,7 @@ class Config(ScreenSettings):
     #: in 3-D. It cannot be combined with SBAS.
     integrity_support: Path | None = None
     araim: AraimBudget = AraimBudget()  #: Risk allocation of the ARAIM levels.
-    #: Largest protection level at which a position is available. P4 uses a car length, 20 m.
+    #: A position is available only if its protection level is at most this. P4 uses a car length, 20 m.
     alarm_limit_m: float = Field(default=20.0, gt=0, le=1e5)
     #: Chainage intervals in which local faults cannot be bounded, so that the protection level is infinite. ``railfix
     #: error-model`` prints the intervals that it finds.
@@ -195,27 +195,27 @@ class Config(ScreenSettings):
     #: Computation of the RAIM protection level of P4: the largest slope times the largest undetected bias.
     raim_protection: Literal["on", "off"] = "off"
     #: Use of the carrier phase. "smoothed" smooths the codes. "float" and "fixed" estimate positions from the codes and
-    #: phases of this and earlier epochs, with float or integer ambiguities ("fixed" requires a base station). On
-    #: recordings, smoothing helps most on a phone, and float ambiguities help most under open sky. In towns, where arcs
-    #: last seconds, neither removes large errors.
+    #: phases up to the epoch, with float or integer ambiguities ("fixed" requires a base station). On recordings,
+    #: smoothing helps most on a phone, and float ambiguities help most under open sky. In towns, where arcs last
+    #: seconds, neither removes large errors.
     carrier: Literal["off", "smoothed", "float", "fixed"] = "off"
     #: Standard deviation of a carrier phase at the zenith, multipath included.
     phase_sigma_m: float = Field(default=0.01, gt=0)
     slips: CycleSlipLimits = CycleSlipLimits()  #: Limits of the cycle-slip detection.
     smoothing: SmoothingLimits = SmoothingLimits()  #: Limits of the smoothing of codes by the carrier phase.
-    continuity: ContinuityLimits = ContinuityLimits()  #: Limits of the test of phase changes along the line.
-    phase: PhaseLimits = PhaseLimits()  #: Limits of the float and integer ambiguities.
-    #: Filter along the track. It combines codes, Dopplers, phase changes and sensors of this and earlier epochs.
+    continuity: ContinuityLimits = ContinuityLimits()  #: Test of phase changes against motion along the line.
+    phase: PhaseLimits = PhaseLimits()  #: Estimation of float ambiguities, and fixing to integers.
+    #: Filter along the track. It combines codes, Dopplers, phase changes and sensor data up to the epoch.
     filter: Literal["track", "off"] = "track"
-    #: Measurements of the filter. Satellites provide `code`, `phase` and `doppler`; on-board sensors provide the
-    #: others. `feature` is the position of a line feature that the inertial unit and the tachometer detect.
+    #: Measurements of the filter. Satellites provide `code`, `phase` and `doppler`; all other measurements come from
+    #: on-board sensors. `feature` is the position of a line feature that the inertial unit and the tachometer detect.
     filter_sources: tuple[FilterSource, ...] = FILTER_SOURCES
     tracking: TrackingLimits = TrackingLimits()  #: Process and measurement noise of the filter.
     sensors: SensorLimits = SensorLimits()  #: Noise of the on-board sensors, and data of the tachometer's wheel.
-    clock_offsets: ClockOffsetLimits = ClockOffsetLimits()  #: Limits of the inter-system biases.
-    single_point: SinglePointLimits = SinglePointLimits()  #: Limits of the 3-D positions of single epochs.
-    section: SectionLimits = SectionLimits()  #: Limits of ambiguous sections.
-    constrained: ConstrainedLimits = ConstrainedLimits()  #: Limits of the iteration along the line.
+    clock_offsets: ClockOffsetLimits = ClockOffsetLimits()  #: Estimation of the inter-system biases.
+    single_point: SinglePointLimits = SinglePointLimits()  #: Limits of the fit of single-epoch 3-D positions.
+    section: SectionLimits = SectionLimits()  #: Limits of the test for ambiguous sections.
+    constrained: ConstrainedLimits = ConstrainedLimits()  #: Limits of the iteration for positions on the line.
 
     @model_validator(mode="before")
     @classmethod
@@ -246,7 +246,7 @@ class Config(ScreenSettings):
     @classmethod
     def _codes_and_each_once(cls, value: tuple[FilterSource, ...]) -> tuple[FilterSource, ...]:
         if "code" not in value or len(set(value)) != len(value):
-            raise ValueError("list each measurement once, and include code, from which the filter starts")
+            raise ValueError("list each measurement only once, and include code: the filter needs it to start")
         return tuple(name for name in FILTER_SOURCES if name in value)
 
     @field_validator("sbas_prn")
@@ -273,7 +273,7 @@ class Config(ScreenSettings):
     @model_validator(mode="after")
     def _support_without_sbas(self) -> Self:
         if self.integrity_support is not None and self.sbas:
-            raise ValueError("integrity_support and SBAS both state satellite errors: use only one of the two")
+            raise ValueError("integrity_support and SBAS both specify the satellite errors: use only one of them")
         return self
 
     @cached_property

@@ -27,7 +27,7 @@ from railfix.positioning.range_arrays import Ranges
 from railfix.positioning.receiver_noise import NoiseState, noise_scale
 from railfix.ranges.corrected import CorrectedRanges
 
-#: Epochs do not affect the noise scale if residual variance / assumed variance exceeds this: (100 sigmas)^2.
+#: An epoch does not affect the noise scale if its residual variance exceeds this times the assumed variance.
 _LARGEST_VARIANCE: Final = 1e4
 
 
@@ -38,8 +38,8 @@ class CheckedPositions(NamedTuple):
     model: LinearModel  #: Linear model at the positions on the line.
     raim: RaimResult
     scale: Floats  #: Noise scale of the receiver, shape (T,).
-    off_map: Masks  #: Epochs with ranges inconsistent with the map, shape (T,).
-    lasting: Masks  #: Satellites with persistent errors, shape (T, K).
+    off_map: Masks  #: True at epochs whose ranges contradict the map, shape (T,).
+    lasting: Masks  #: True for satellites with persistent errors, shape (T, K).
 
 
 def check_ranges(
@@ -50,7 +50,7 @@ def check_ranges(
     config: Config,
     states: Sequence[AntennaState],
 ) -> tuple[CorrectedRanges, Ranges, CheckedPositions, list[AntennaState]]:
-    """Exclude persistent faults and then single faults; return the ranges, the positions with noise scales, and states.
+    """Exclude persistent, then single faults; return ranges, positions with noise scales, and each antenna's new state.
 
     The robust noise scale, which RAIM uses, is estimated from mutually consistent ranges. The reported noise scale is
     estimated from the ranges that remain after RAIM.
@@ -122,7 +122,7 @@ def contradict_map(ranges: Ranges, antennas: AntennaRows, fix: LineFix, arc: Flo
 
     Ranges contradict the map if the position on the line fits significantly worse than the 3-D position (chi-square
     test with `Config.off_map_risk`). The difference of the weighted sums of squares is divided by the residual variance
-    of the 3-D fit, or by 1 if the variance is smaller.
+    of the 3-D fit, but by at least 1.
     """
     point, constrained = fix.point, fix.constrained
     wsse = constrained.wsse

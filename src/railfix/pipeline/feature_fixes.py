@@ -25,19 +25,19 @@ from railfix.track.curves import curved_line
 from railfix.track.trajectory import Trajectory
 from railfix.tracking import Line
 
-#: Minimum number of whole metres, passed without a break, for a comparison with a feature.
+#: A feature is compared only if the profile has at least this number of points, spaced one metre, without a break.
 _LEAST_POINTS: Final = 30
 
 
 @dataclass(frozen=True, kw_only=True)
 class LineFeatures:
-    """Gradient, curvature and ordered features of a line; arc lengths refer to the line itself."""
+    """Gradient, curvature and ordered features of a line; arc lengths are along the line."""
 
     series: LineSeries
     features: tuple[Feature, ...]
     antenna_m: Floats  #: Arc lengths of the vertices of the antenna's trajectory, shape (V,).
     body_m: Floats  #: Arc length of the body's middle on the line when the antenna is at each vertex, shape (V,).
-    line: Line  #: The line itself, for distances that may cross the join of a closed line.
+    line: Line  #: Computes distances, also across the join of a closed line.
 
     @classmethod
     def of(cls, track: Track, trajectory: Trajectory) -> LineFeatures:
@@ -56,8 +56,7 @@ class LineFeatures:
         return np.interp(antenna_m, self.antenna_m, self.body_m)
 
 
-#: Minimum standard deviation of a feature's position, due to errors of the map and to the body's motion on the bogies
-#: [m].
+#: Minimum standard deviation of a position from a feature, due to the map and the body's motion on the bogies [m].
 _FEATURE_SIGMA_M: Final = 0.5
 
 
@@ -91,24 +90,24 @@ class TrackFeatures:
 class FeatureFix:
     """Verdict on one feature."""
 
-    tick: int  #: Index of the first tick at which the body's middle is `HALF_LENGTH_M` beyond the feature.
+    tick: int  #: First tick (index) at which the body's middle is `HALF_LENGTH_M` beyond the feature.
     feature: Feature
     located: LocatedFeature
 
     @property
     def correction_m(self) -> float:
-        """Position by the feature minus the wheel position [m]; NaN unless the feature is accepted."""
+        """Position from the feature minus wheel position [m]; NaN unless the feature is accepted."""
         return self.located.arc_m - self.feature.arc_m
 
 
 class _Stretch(NamedTuple):
-    """Consecutive usable ticks from `first` on, and the whole metres passed without a break up to the last tick."""
+    """Consecutive usable ticks from `first` on, with heading and pitch at each whole metre since the last break."""
 
     first: int
-    sense: float  #: Direction: 1 toward rising arc length, else -1.
+    sense: float  #: Direction of travel: 1 toward rising arc length, else -1.
     distance_m: Floats  #: Wheel distance at all ticks of the chunk; index 0 is the tick before the chunk.
-    body_m: Floats  #: Position of the body's middle at each tick of the stretch.
-    #: Position `HALF_LENGTH_M` behind the body's middle at each tick; features up to it are compared.
+    body_m: Floats  #: Position of the body's middle at each tick from `first` on.
+    #: Position `HALF_LENGTH_M` behind the body's middle at each tick; features up to this position are compared.
     behind_m: Floats
     metre: Integers
     heading_rad: Floats
@@ -127,11 +126,11 @@ def _fix_feature(
     facing: float,
     last: tuple[float, float, float] | None,
 ) -> FeatureFix | None:
-    """Compare the profile with a feature; `noise` has the sigma of the wheel position and the profile's sigmas."""
+    """Compare a stretch's profile with a feature; `noise` has the sigmas of wheel position, gradient and curvature."""
     tick = stretch.first + int(np.argmax(stretch.sense * (stretch.behind_m - feature.arc_m) >= 0.0))
     shift, distance = stretch.shift_m(tick), stretch.distance_m[tick + 1]
-    # The profile refers to rising arc length. For a reversing or turned vehicle, the sign of the pitch changes, but the
-    # sign of the heading does not.
+    # Signs of the profile are for rising arc length. For a reversing or turned vehicle, the sign of the pitch changes,
+    # but the sign of the heading does not.
     passed = np.flatnonzero(stretch.sense * (stretch.metre - distance) <= 0.0)[:: int(stretch.sense)]
     place = np.asarray(stretch.metre[passed] + shift, dtype=np.float64)
     profile = (place, stretch.heading_rad[passed], facing * stretch.pitch_rad[passed])
@@ -156,10 +155,10 @@ def feature_fixes(
 ) -> tuple[list[FeatureFix], FeatureState]:
     """Return verdicts on the features that the train has passed, and the state for the next chunk.
 
-    A feature is compared as soon as the body's middle is `HALF_LENGTH_M` beyond it. Only ticks without slip and faster
-    than 1 m/s are used. Other ticks are breaks, which restart the integration of heading and pitch. `facing` is 1 if
-    the front points to rising arc length, else -1; `sigma_m` is the standard deviation of the wheel position; `noise`
-    has the standard deviations of gradient and curvature over one metre.
+    A feature is compared as soon as the body's middle is `HALF_LENGTH_M` beyond it. Ticks with slip or a speed of at
+    most 1 m/s are breaks, which restart the integration of heading and pitch. `facing` is 1 if the front points to
+    rising arc length, else -1; `sigma_m` is the standard deviation of the wheel position; `noise` has the standard
+    deviations of gradient and curvature over one metre.
     """
     distances = np.concatenate([[0.0], rates.distance_m]) + state.distance_m
     heading, pitch = (
@@ -178,7 +177,7 @@ def feature_fixes(
             metre, headings, pitches = metre[:0], headings[:0], pitches[:0]
         if end - begin < 2:
             continue
-        rows = slice(begin + 1, end + 1)  # ticks begin + 1 .. end - 1, with the preceding tick at index begin + 1
+        rows = slice(begin + 1, end + 1)  # tick k has row k + 1; row begin + 1 is the tick before the stretch
         distance = distances[rows]
         whole = _whole_metres(distance)
         if len(metre) and len(whole) and whole[0] != metre[-1] + np.sign(distance[-1] - distance[0]):

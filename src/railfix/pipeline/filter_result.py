@@ -43,11 +43,11 @@ class FilterFix:
 class SingleEpochs:
     """Results of single epochs that the filter along the track uses, shape (T,) each."""
 
-    noise_scale: Floats  #: Code noise of the receiver divided by the range sigmas.
+    noise_scale: Floats  #: Ratio of the receiver's code noise to its range sigmas.
     #: Single-epoch positions. After an outage, codes are used again once these positions agree with dead reckoning.
     arc_m: Floats
     sigma_m: Floats
-    near_ecef_m: Floats  #: 3-D position without the line, shape (T, 3).
+    near_ecef_m: Floats  #: 3-D position, not constrained to the line, shape (T, 3).
     off_map: Masks  #: True where the train is away from the line (`railfix.pipeline.off_map`).
     map_offset: Masks  #: True where the mean 3-D position of the last minutes is beside, above or below the line.
     suspicion: Codes  #: `railfix.integrity.interference.Suspicion`.
@@ -62,8 +62,8 @@ class FilterState(NotebookTable):
     track: TrackState | None = None
     level: LevelState = field(default_factory=LevelState)  #: State of the filter that computes the levels.
     sensors: SensorState = field(default_factory=SensorState.empty)
-    fixed: FilterFix | None = None  #: Filter position at the last epoch.
-    anchor: FilterFix | None = None  #: Filter position at the last epoch before the current block.
+    fixed: FilterFix | None = None  #: Filter position at the last epoch; None before the first.
+    anchor: FilterFix | None = None  #: Filter position before the current block of epochs; None before the first.
     gate: ReturnState = field(default_factory=ReturnState)
     #: State of the comparison of wheel distances with distances between single-epoch positions.
     wheel: WheelState = field(default_factory=WheelState)
@@ -92,18 +92,19 @@ class FilterState(NotebookTable):
 class AlongTrack(LineCoordinates, NotebookTable):
     """Filtered positions of one antenna at T epochs."""
 
-    tracked: Tracked  #: Output of the filter, with the channels of `AntennaResult.corrected`.
+    tracked: Tracked  #: Output of the filter, for the channels in `AntennaResult.corrected`.
     trajectory: Trajectory  #: Trajectory of the antenna.
-    #: Positions on the trajectory. Positions slightly beyond an end are moved to the end; NaN farther out; shape (T,).
+    #: Positions on the trajectory, shape (T,). Slightly beyond an end, they are moved to the end; farther out, they are
+    #: NaN.
     arc_m: Floats
-    #: Direction: 1 toward rising chainage, -1 toward falling, 0 where the speed is too small; shape (T,).
+    #: Direction: 1 toward rising chainage, -1 toward falling chainage, 0 if the speed is too small; shape (T,).
     direction: Codes
     standstill: Masks  #: True where the speed plus two sigmas is below 1 km/h; shape (T,).
     #: Motion since the previous epoch, and shape of the line under the body, measured by wheel and inertial unit.
     sensed: SensedMotion
-    #: Distance between the positions of both antennas minus the antenna spacing; NaN where not compared; shape (T,).
+    #: Distance between the antennas' positions minus the antenna spacing; NaN if they are not compared; shape (T,).
     spacing_error_m: Floats
-    #: Comparison of satellite-derived distances with wheel distances; None without a wheel.
+    #: Comparison of satellite-derived distances with wheel distances; None without wheel distances.
     wheel: WheelSigns | None = None
     passings: tuple[Passing, ...] = ()  #: Passed balises and virtual balises, and wrong readings.
 
@@ -125,7 +126,7 @@ class AlongTrack(LineCoordinates, NotebookTable):
         return f"<AlongTrack: {self.status_text()}, {time_span_text(self.time)}>"
 
     def status_text(self) -> str:
-        """Return the number of bounded positions as text: ``1,890 of 2,000 epochs tracking or coasting``."""
+        """Return the number of epochs with a bounded error: ``1,890 of 2,000 epochs tracking or coasting``."""
         return f"{int(is_bounded(self.tracked.status).sum()):,} of {plural(self, 'epoch')} tracking or coasting"
 
     def summary(self) -> dict[str, str]:
@@ -140,7 +141,7 @@ class Replay:
 
     epochs: GnssEpochs
     sensors: SensorEpochs
-    before: TrackState | None  #: Filter state before the epochs.
+    before: TrackState | None  #: Filter state before the epochs; None at the start.
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)

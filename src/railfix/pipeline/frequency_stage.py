@@ -20,11 +20,11 @@ from railfix.screens import Screened, Verdict
 
 #: Name of this stage's verdict.
 NAME: Final = "two_frequencies"
-#: Arc over which the ionospheric model error is correlated [rad]: 1000 km.
+#: Correlation length of the ionospheric model error, as an angle at the Earth's centre [rad]: 1000 km.
 _IONOSPHERE_ARC: Final = 0.157
 #: Deviation of a satellite's delay from a common offset with two gradients over the sky, as a fraction of the delay.
-#: For Galileo, it was 0.06 at a station in a solar minimum (mean delay 1.5 m), 0.02 on a drive in Japan (3.9 m), and
-#: 0.05 on a roof in Japan in 2024 (6.4 m). Walter et al. (Navigation 48, 2001) use 0.35 m.
+#: For Galileo, the fraction was 0.06 at a station in a solar minimum (mean delay 1.5 m), 0.02 on a drive in Japan (3.9
+#: m), and 0.05 on a roof in Japan in 2024 (6.4 m). Walter et al. (Navigation 48, 2001) use 0.35 m instead.
 _IONOSPHERE_REST: Final = 0.05
 
 
@@ -68,13 +68,13 @@ def combine_frequencies(
         bound_sigma_m=np.hypot(local_m * magnified, nominal_m),
         bias_m=corrected.bias_m * magnified,
     )
-    screened = Screened(metric=found.difference_m, reject=found.suspected)  # no limit: it differs between satellites
+    screened = Screened(metric=found.difference_m, reject=found.suspected)  # no common limit of all satellites
     verdict = Verdict(name=NAME, reason=Reason.USED, screened=screened, error_m=found.difference_m)
     return corrected, found, verdict, after
 
 
 def _field_of_ionosphere(ranges: CorrectedRanges, vertical_m: Floats) -> Floats:
-    """Return sigmas of the ionospheric model error, (T, K, 4) [m]: offset, two gradients, satellite remainder."""
+    """Return sigmas of the ionospheric model error, (T, K, 4) [m]: offset, two gradients, rest of each satellite."""
     obliquity, azimuth = thin_shell_obliquity(ranges.elevation_deg), np.radians(ranges.azimuth_deg)
     offset = vertical_m[:, None] * obliquity
     to_pierce_point = np.radians(90.0 - ranges.elevation_deg) - np.arccos(1.0 / obliquity)

@@ -41,9 +41,9 @@ from railfix.ranges.corrected import CorrectedRanges
 _CONTRADICTED: Final = int(
     Reason.FAULT_EXCLUDED | Reason.LASTING_ERROR | Reason.GROSS_ERROR | Reason.ALONE_ON_ITS_CLOCK
 )
-#: Rejection reasons that indicate individual errors of satellites, provided that only few satellites have them.
+#: Rejection reasons that count as individual errors if only few satellites have them.
 _WRONG_ALONE: Final = int(Reason.FAULT_EXCLUDED | Reason.LASTING_ERROR | Reason.GROSS_ERROR)
-#: Errors of more satellites than this are not individual errors; a spoofer with a consistent position affects more.
+#: Errors of more satellites than this are not individual errors; a spoofer's consistent position affects more.
 _MOST_WRONG: Final = 2
 #: Gross errors of more satellites of one clock than this are not individual errors.
 _MOST_GROSS: Final = 4
@@ -58,7 +58,7 @@ _FAILED: Final = np.isin(np.arange(len(Status)), [
     Status.OFF_MAP, Status.INCONSISTENT, Status.MAP_OFFSET, Status.NO_CONVERGENCE,
 ])  # fmt: skip
 _IN_DOUBT: Final = _FAILED | (np.arange(len(Status)) == Status.UNCERTAIN)
-#: For each suspicion: the statuses that it replaces, and the new status.
+#: For each suspicion: a mask of the statuses that it replaces, and the new status.
 _STATUS_BY_CAUSE: Final = (
     (Suspicion.JAMMING_SUSPECTED, np.arange(len(Status)) == Status.OK, Status.JAMMING_SUSPECTED),
     (Suspicion.SPOOFING_SUSPECTED, _UNDER_SPOOFING, Status.SPOOFING_SUSPECTED),
@@ -67,7 +67,7 @@ _STATUS_BY_CAUSE: Final = (
 )
 #: Interval between the checks for interference [ns].
 _SECOND_NS: Final = 1_000_000_000
-#: Start of the count of GPS seconds [ns]: 5 ms before the GPS epoch, because a time tag may be slightly early.
+#: Origin of GPS seconds [ns]: 5 ms before the start of GPS time, because a time tag may be slightly early.
 _FIRST_NS: Final = int(GPS_EPOCH.astype(np.int64)) - 5_000_000
 
 
@@ -78,8 +78,8 @@ class InterferenceState:
     power: PowerState = field(default_factory=PowerState)
     motion: MotionSignState = field(default_factory=MotionSignState)
     held: HeldState = field(default_factory=HeldState)
-    second: int = -1  #: GPS second of the last checked epoch.
-    broken: bool = False  #: Whether the data had a break since the last checked epoch.
+    second: int = -1  #: GPS second of the last checked epoch; -1 before the first.
+    broken: bool = False  #: True after a data break since the last checked epoch.
     alarm: int = 0  #: Receiver alarms since the last checked epoch.
     latest: Interference | None = None  #: Result at the last checked epoch.
 
@@ -88,7 +88,7 @@ class InterferenceState:
 class Interference(NotebookTable):
     """Signs of interference at T epochs."""
 
-    causes: Bits  #: `Sign` bits, each held for its release time; shape (T,).
+    causes: Bits  #: `Sign` bits, shape (T,); each stays set for a release time after its sign ends.
     power: PowerSigns
     motion: MotionSigns
 
@@ -101,8 +101,8 @@ class Interference(NotebookTable):
 def _motion_inputs(
     corrected: CorrectedRanges, single: Solution, antennas: AntennaRows, rows: Indices, broken: Masks
 ) -> MotionInputs:
-    """Return the inputs of the motion signs at selected epochs, from ranges with the rejection reasons of all stages;
-    `broken` marks breaks since the previous selected epoch.
+    """Return inputs for the signs of interference in motion, at selected epochs. `corrected` has the rejection reasons
+    of all stages; `broken` marks data breaks since the previous selected epoch.
     """
     code, reason = corrected.code_m[rows], corrected.reason[rows]
     consistent, off_line, antenna = single.consistent_ecef_m[rows], np.empty(len(rows)), np.empty(len(rows), np.intp)
@@ -213,8 +213,8 @@ class _Due(NamedTuple):
 
     rows: Indices  #: Indices of these epochs among the rows of all antennas, shape (n,).
     group: Indices  #: Number of checked epochs up to each epoch of the antenna, shape (T,).
-    #: Receiver alarms (and breaks, in `broken`) in the intervals up to each checked epoch and after the last; shape (n
-    #: + 1,).
+    #: Receiver alarms between checked epochs: before each checked epoch and after the last, shape (n + 1,). `broken`
+    #: has the data breaks in the same intervals.
     alarm: Bytes
     broken: Masks
     last: int  #: GPS second of the last epoch of the chunk.
@@ -303,7 +303,7 @@ def judge_interference(
             )  # fmt: skip
         if len(own.group):
             new, state = _on_all_epochs(own, new, state)
-        assert new is not None, "an epoch without one before it is due"
+        assert new is not None, "the first epoch is always checked"
         found.append(new)
         after.append(state)
     return found, after

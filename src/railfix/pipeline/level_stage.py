@@ -36,11 +36,11 @@ from railfix.positioning.range_arrays import Ranges
 from railfix.ranges.corrected import CorrectedRanges
 
 #: Kinds of protection levels. With SBAS, which covers satellite faults, the hypotheses are local faults only.
-#: Otherwise, satellite faults are added (solution separation).
+#: Otherwise, they also include satellite faults (solution separation).
 KINDS: Final[tuple[str, str]] = ("sbas", "separation")
 
 
-#: Whether each status raises an alarm; the index is the status number.
+#: True for each status that makes the protection level an alarm; the index is the status number.
 _ALARMING: Final = np.array(
     [status in (*CHECK_FAILED, Status.OFF_MAP, Status.MAP_OFFSET) for status in range(max(Status) + 1)]
 )
@@ -55,7 +55,7 @@ def choose_basis(config: Config) -> str:
 
 
 def prior_basis_text(facts: Mapping[str, Any]) -> str:
-    """Return a sentence on whether the fault priors of a run's levels (`level_facts`) are measured and supported."""
+    """Return a sentence on whether a run's fault priors (`level_facts`) were measured, and supported by data."""
     words = {
         "indicative": "indicative: priors of faults are assumed, not measured on this line; no hourly risk is claimed",
         "measured": "priors of local faults are measured on this line, risk.map_prior is assumed",
@@ -109,7 +109,7 @@ def get_risk_budget(config: Config) -> RiskBudget:
 
 
 def level_scale(scale: Floats, config: Config) -> Floats:
-    """Return the noise scale of the levels, shape (T,): at least 1, except with an error model and without SBAS."""
+    """Return the levels' noise scale, shape (T,). Only with an error model and without SBAS, it may be below 1."""
     return np.maximum(scale, 1.0) if config.error_model is None or config.sbas else scale
 
 
@@ -155,8 +155,8 @@ def protection_levels(
 ) -> ProtectionResult:
     """Return the protection levels of a chunk, from the linear model of the positions on the line.
 
-    The part of the measured map offset that exceeds one sigma is a bias in the level; the hypothesis of a wrong map
-    covers an undetected offset. Small residuals do not reduce a level: `level_scale` limits the noise scale, and range
+    If the measured map offset exceeds one sigma, the excess is added to the level as a bias. The hypothesis of a wrong
+    map covers undetected offsets. Small residuals do not reduce a level: `level_scale` limits the noise scale, and
     sigmas are at least those of the error model. `scale` has shape (T,). `sides` is the result of `late_sides`.
     """
     covariance = np.where(raim.faulty[:, None, None], np.nan, model.covariance_m2)
@@ -171,7 +171,7 @@ def protection_levels(
 
 
 def overbound_model(sigma_m: Floats, ranges: Ranges, antennas: AntennaRows, fix: LineFix) -> tuple[LinearModel, Floats]:
-    """Return the linear model with overbounding range sigmas `sigma_m` (T, K), and its noise scale: ones, (T,)."""
+    """Return the linear model with overbounding range sigmas `sigma_m` (T, K), and a noise scale of 1, shape (T,)."""
     weight = np.where(ranges.weight > 0, 1.0 / sigma_m**2, 0.0)
     found = fix.constrained
     model = linear_model(replace(ranges, weight=weight), antennas, found.arc_m, section=found.section)
@@ -197,12 +197,12 @@ def late_sides(azimuth_deg: Floats, elevation_deg: Floats, heading_deg: Floats, 
 def apply_verdicts(
     protection: ProtectionResult, status: Codes, has: Masks, chainage_m: Floats, config: Config
 ) -> ProtectionResult:
-    """Apply the verdicts on the positions to the protection levels, and return the levels.
+    """Return the protection levels, adapted to the statuses and coordinates of the positions.
 
-    A level is valid at the position where the ranges were linearised. If another position fits the ranges equally well,
-    or the ranges place the antenna beyond an end of the map, the level is unavailable. A failed check, or a
-    contradiction of ranges and map, is an alarm. Epochs without coordinates (`has`) have no level; a level that reaches
-    a stretch of `Config.no_level_m` is infinite.
+    A level is valid only for the position at which the ranges were linearised. If another position fits the ranges
+    equally well, or the ranges place the antenna beyond an end of the map, the level is unavailable. A failed check, or
+    a contradiction of ranges and map, is an alarm. Where `has` is False, there are no coordinates and no level. If the
+    position plus or minus the level touches a stretch of `Config.no_level_m`, the level is infinite.
     """
     level, verdict = protection.level, protection.status
     if config.no_level_m or not has.all():
@@ -241,7 +241,8 @@ def compute_araim(
     """Compute ARAIM levels of positions on the line, shape (T,).
 
     The integrity sigmas combine the URA of the message, the atmospheric errors of `Config.nominal` and the scaled range
-    noise. Accuracy and thresholds use the URE instead of the URA. `corrected` has the rejection reasons of all stages.
+    noise. Sigmas of accuracy and thresholds have the URE, not the URA. `corrected` has the rejection reasons of all
+    stages.
     """
     place = antennas.at_arc(solution.arc_m)
     sight, clocks, channels = _sight(corrected, place)
@@ -283,7 +284,7 @@ def compute_araim(
 
 
 def _sight(corrected: CorrectedRanges, place: Floats) -> tuple[Floats, Floats, Masks]:
-    """Return unit vectors (T, M, 3) and clock columns (M, G) of M channels that are ever used, and a mask (K,)."""
+    """Return unit vectors (T, M, 3) and clock columns (M, G) of the M used channels of a chunk, and their mask (K,)."""
     channels = (corrected.reason == 0).any(axis=0)
     to_satellite = corrected.satellites.position_ecef_m[:, channels] - place[:, None, :]
     distance = np.linalg.norm(to_satellite, axis=2, keepdims=True)

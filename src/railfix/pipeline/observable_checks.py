@@ -1,7 +1,7 @@
 """Check of signs and units of Dopplers and carrier phases against satellite range rates.
 
-A satellite's motion changes its range by up to 800 m/s, much more than a train or a receiver clock does. The ratio (the
-factor) of a constellation's Dopplers, or phase changes, to the computed range rates should be 1. It is -1 if the sign
+A satellite's motion changes its range by up to 800 m/s, much more than a train or a receiver clock does. The factor,
+the ratio of a constellation's Dopplers or phase changes to the computed range rates, should be 1. It is -1 if the sign
 is wrong, and the wavelength if the log has metres in place of cycles.
 """
 
@@ -22,16 +22,16 @@ from railfix.ranges.corrected import CorrectedRanges
 
 #: A satellite contributes to a factor if its range rate differs from the constellation's median by at least this [m/s].
 _LEAST_RATE_MPS: Final = 100.0
-#: Minimum number of satellites for a factor; at least one more must be observed, for the median rate.
+#: A factor requires at least this number of satellites, and one more because the median rate is subtracted.
 _LEAST_SATELLITES: Final = 3
-#: With at least this number of satellites, one satellite's factor may deviate. With only four satellites, a cycle slip
-#: of one changes the factors of the others.
+#: With at least this number of satellites, a factor is valid even if one satellite deviates from it. With only four
+#: satellites, a cycle slip of one satellite changes the factors of all.
 _MANY: Final = 6
-#: Largest deviation of a satellite's factor from the median factor.
+#: A satellite deviates from the factor if its own ratio differs from the median by more than this.
 _SPREAD: Final = 0.3
-#: Largest deviation of a correct factor from 1; the speed of the train causes part of it.
+#: Dopplers or phases are removed if their factor differs from 1 by more than this; the train's speed contributes.
 _RIGHT: Final = 0.5
-#: Longest time between two epochs whose phases are compared [s].
+#: Phase changes are not computed over more than this time [s].
 _LONGEST_S: Final = 35.0
 _KINDS: Final = ("Dopplers", "phases")
 _UNITS: Final = ("Hz", "cycles")
@@ -44,7 +44,7 @@ class ObservableState:
 
     #: Last factors of Dopplers and of phases, NaN before the first factor; shape (2, L).
     factor: Floats = field(default_factory=lambda: np.empty((2, 0)))
-    #: Constellation letters, shape (L,); "" is for all constellations together.
+    #: Constellation letters, shape (L,); "" stands for all constellations together.
     letter: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U1"))
     #: Names, phases and range rates of the channels at the last epoch used for factors, shape (K,) each.
     channel: Strings = field(default_factory=lambda: np.zeros(0, dtype="<U6"))
@@ -116,7 +116,7 @@ def rate_factor(observed_mps: Floats, expected_mps: Floats) -> Floats:
 
 
 def _held(factor: Floats, before: float, chosen: Masks) -> Floats:
-    """Return the factor at each epoch (T,): the last known factor of the `chosen` epochs so far, or `before`."""
+    """Return each epoch's factor (T,): the last known factor of the `chosen` epochs up to it, or else `before`."""
     values = np.concatenate([[before], factor])
     last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), 0))
     return np.asarray(values[last][np.cumsum(chosen)])
@@ -125,7 +125,7 @@ def _held(factor: Floats, before: float, chosen: Masks) -> Floats:
 def _phase_rates(
     time: Datetimes, channel: Strings, phase_m: Floats, rate_mps: Floats, state: ObservableState
 ) -> tuple[tuple[Floats, Floats], ObservableState]:
-    """Return phase rates since the previous epoch and mean range rates [m/s], shape (T, K) each, and the state."""
+    """Return phase rates and mean range rates since the previous epoch [m/s], shape (T, K) each, and the state."""
     if not len(time):
         return (phase_m, rate_mps), state
     joined = join_channels(channel, [state.channel])
@@ -142,7 +142,7 @@ def _phase_rates(
 
 
 def _without(corrected: CorrectedRanges, letters: Strings, bad: dict[int, Masks]) -> CorrectedRanges:
-    """Remove Dopplers (kind 0) or phases (kind 1) of bad constellations; `bad` has a mask (T, K) for each bad kind."""
+    """Remove the Dopplers (kind 0) or phases (kind 1) that `bad` marks, with a mask (T, K) for each faulty kind."""
     obs: Observations = corrected.observations
     of_channel: Indices = (obs.satellite.astype("<U1")[:, None] == letters).astype(np.intp)
     values = {"doppler_hz": obs.doppler_hz, "phase_cycles": obs.phase_cycles}

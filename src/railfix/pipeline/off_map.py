@@ -14,7 +14,7 @@ from railfix.core.timescale import seconds
 _NEVER: Final = np.datetime64("NaT", "ns")
 #: Time constant of the mean offset from the line while a train is off the map [s].
 _REMEMBERED_S: Final = 30.0
-#: A train is back on the line if its mean offset on the map is at most this fraction of its mean offset off the map.
+#: A train is back on the line if its recent mean offset is at most this fraction of its mean offset while off the map.
 _BACK_SHARE: Final = 0.5
 #: A train is also back on the line if the mean offset of its positions is at most this limit [m].
 _BACK_M: Final = 1.0
@@ -26,11 +26,10 @@ class OffMapState:
 
     off: bool = False  #: True if the train was off the map at the last epoch.
     known: bool = False  #: True after the first tested position; until then, one position is enough to set `off`.
-    #: Time of the first of the latest consecutive positions that contradict `off`; NaT if the last position agrees with
-    #: `off`.
+    #: Start of the current series of positions that contradict `off`; NaT if the last position agrees with `off`.
     since: np.datetime64 = _NEVER
-    back: Floats = field(default_factory=lambda: np.zeros(2))  #: Sum and number of the offsets from `since` on.
-    away: Floats = field(default_factory=lambda: np.zeros(2))  #: Decayed sum and number of offsets off the map.
+    back: Floats = field(default_factory=lambda: np.zeros(2))  #: Sum [m] and number of offsets from `since` on.
+    away: Floats = field(default_factory=lambda: np.zeros(2))  #: Decaying sum and number of offsets while off the map.
     away_at: np.datetime64 = _NEVER  #: Time of the last offset in `away`.
 
 
@@ -41,8 +40,8 @@ def off_map_epochs(
 
     The train leaves the map once all positions of the last `least_s` are off the map; because of reflected signals, a
     single position can be off the map. The train returns once all positions of the last `least_s` are on the map, and
-    their mean offset is at most a metre or half of the mean offset off the map. This second condition is needed because
-    single positions on an unmapped track beside the line fit the map by chance. At the start of a log, the first
+    their mean offset is at most 1 m, or at most half of the mean offset while off the map. The mean offset is tested
+    because some positions on an unmapped track beside the line fit the map by chance. At the start of a log, the first
     position alone decides. `on_map` and `off_map` mark epochs whose ranges fit the map, and epochs whose ranges
     contradict it; `offset_m` is the offset of 3-D positions to the right of the line, NaN if unknown; shapes (T,).
     """

@@ -12,11 +12,11 @@ from railfix.core.timescale import seconds
 from railfix.pipeline.sensor_epochs import SensorLimits
 from railfix.tracking import Line
 
-#: Time without codes after which the filter's position counts as dead-reckoned [s].
+#: An interval of at least this length without codes counts as an outage [s].
 _OUTAGE_S: Final = 2.0
-#: Number of consecutive positions that must agree with dead reckoning before codes are used again.
+#: After an outage, codes are used once this number of consecutive positions agree with dead reckoning.
 _AGREEING: Final = 3
-#: Standard deviation of a sensor distance since the start of a block, as a fraction of the distance.
+#: Standard deviation of the sensor distance since the start of a block of epochs, as a fraction of the distance.
 _DISTANCE_SHARE: Final = 0.01
 #: Minimum standard deviation of a single-epoch position at the end of a tunnel, where the portal causes multipath [m].
 _LEAST_SIGMA_M: Final = 2.0
@@ -30,8 +30,8 @@ class ReturnState:
     time: np.datetime64 = _NEVER  #: Last epoch whose codes were used; NaT before the first.
     place_m: float = float("nan")  #: Dead-reckoned position at the last epoch; NaN without a sensor distance.
     sigma_m: float = float("nan")  #: Standard deviation of the filter position from which dead reckoning started.
-    distance_m: float = 0.0  #: Sensor distance since the filter's last position.
-    returned: np.datetime64 = _NEVER  #: First epoch with codes after the outage; NaT without an outage.
+    distance_m: float = 0.0  #: Sensor distance since dead reckoning started.
+    returned: np.datetime64 = _NEVER  #: First epoch with codes after an outage; NaT if codes are used.
     agreeing: int = 0  #: Number of consecutive positions that have agreed since `returned`.
 
 
@@ -52,8 +52,8 @@ def gated_codes(
     `SensorLimits.return_s` in any case. Without a sensor distance no code is rejected.
 
     `observed` marks epochs with codes, `distance_m` is the sensor distance since the previous epoch, `place_m` and
-    `sigma_m` are single-epoch positions; shape (T,) each, NaN where missing. `state` has the filter's position at the
-    epoch before the first.
+    `sigma_m` are single-epoch positions and sigmas; shape (T,) each, NaN where missing. `state` has the filter's
+    position at the epoch before the first.
     """
     refused = np.zeros(len(time), dtype=np.bool_)
     distances = state.distance_m + np.cumsum(distance_m)

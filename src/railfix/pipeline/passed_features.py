@@ -11,7 +11,7 @@ from railfix.core.arrays import Datetimes, Floats, Integers, Masks
 from railfix.core.timescale import seconds
 from railfix.track.trajectory import Trajectory
 
-#: Lowest speed at which the rates of the body are used [m/s].
+#: The body's rates are used only above this speed [m/s].
 SLOWEST_MPS: Final = 1.0
 
 
@@ -28,11 +28,11 @@ class RateSeries:
 
     time: Datetimes  #: Times at which the rates are valid, shape (K,).
     known: Datetimes  #: Times at which the rates became known, shape (K,).
-    distance_m: Floats  #: Wheel distance since the tick before the first tick, in rising arc length; shape (K,).
+    distance_m: Floats  #: Wheel distance since the tick before the first, positive toward rising arc length; (K,).
     arc_m: Floats  #: Antenna position by dead reckoning with the wheel, shape (K,); NaN if unknown.
-    turned_rad: Floats  #: Change of heading since the previous tick, positive to the right; shape (K,).
+    turned_rad: Floats  #: Change of heading since the previous tick, positive if it turns right; shape (K,).
     climbed_rad: Floats  #: Change of pitch since the previous tick, positive with the nose up; shape (K,).
-    speed_mps: Floats  #: Speed in rising arc length, shape (K,).
+    speed_mps: Floats  #: Speed, positive toward rising arc length, shape (K,).
     rolls: Masks  #: True where the wheel rolls without slip, shape (K,).
 
     def arc_at(self, time: Datetimes) -> Floats:
@@ -48,13 +48,13 @@ class FeatureState:
 
     distance_m: float = 0.0  #: Wheel distance at the last tick.
     angles: tuple[float, float] = (0.0, 0.0)  #: Heading and pitch at the last tick, from an arbitrary origin [rad].
-    #: Whole metres passed without a break, in the order of travel; shape (M,).
+    #: Whole metres of wheel distance passed since the last break, in the order of travel; shape (M,).
     metre: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     heading_rad: Floats = field(default_factory=lambda: np.empty(0))  #: Heading at each metre, shape (M,).
     pitch_rad: Floats = field(default_factory=lambda: np.empty(0))  #: Pitch at each metre, shape (M,).
-    #: Position of the last accepted feature, its standard deviation, and the wheel distance at the feature [m].
+    #: Position and standard deviation of the last accepted feature, and the wheel distance there [m]; None without one.
     last: tuple[float, float, float] | None = None
-    done_m: float = float("nan")  #: Position up to which features have been compared; NaN before the first.
+    done_m: float = float("nan")  #: Features up to this position have been compared; NaN at the start.
 
 
 class PassedFeature(NamedTuple):

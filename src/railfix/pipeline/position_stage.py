@@ -1,4 +1,4 @@
-"""Compute antenna positions, conventional and on the line, with sigma, protection level and status.
+"""Compute conventional 3-D antenna positions, and positions on the line with sigma, protection level and status.
 
 The stages run in this order (P1 figure 1): 3-D position, inter-system biases, section search, constrained fix,
 persistent biases and single faults, noise scale, test of the map, protection level, carrier phase, status.
@@ -131,7 +131,7 @@ def _with_protection_level(checked: CheckedPositions, config: Config) -> RaimRes
 
 
 def _alone_on_clock(reason: Bits, groups: Sequence[slice], ties: InterSystemBiases) -> Masks:
-    """Return a mask (T, K) of satellites whose clock has no other used satellite and no known bias."""
+    """Return a mask (T, K) of satellites that are the only used satellite of a clock with unknown bias."""
     alone = np.zeros(reason.shape, dtype=bool)
     for g, group in enumerate(groups):
         used = reason[:, group] == 0
@@ -140,14 +140,14 @@ def _alone_on_clock(reason: Bits, groups: Sequence[slice], ties: InterSystemBias
     return alone
 
 
-#: Ranges are inconsistent if the residual variance of a 3-D fit exceeds the receiver's range variance by this factor.
+#: Ranges are inconsistent if the residual variance of a 3-D fit is over this number of times the range variance.
 _CONTRADICT: Final = 25.0
 
 
 def _consistent(
     agreeing: Ranges, free: SinglePoint, excluded: Masks, corrected: CorrectedRanges, scale: Floats, config: Config
 ) -> tuple[Ranges, SinglePoint]:
-    """Return ranges and 3-D positions for the test of the map, without `excluded` satellites at inconsistent epochs.
+    """Return ranges and 3-D positions for the map test; at inconsistent epochs, satellites in `excluded` are left out.
     Positions are NaN where the remaining ranges are inconsistent, or the faulty range cannot be identified.
     """
     wrong = excluded & (agreeing.weight > 0) & _contradict(free, agreeing.space_redundancy, scale)[:, None]
@@ -172,7 +172,7 @@ class PublishedPositions(NamedTuple):
     arc_m: Floats
     along_m: Floats  #: Standard deviation along the line.
     epoch_m: Floats  #: Single-epoch sigma.
-    judged_m: Floats  #: Sigma compared with `Config.largest_sigma_m`.
+    judged_m: Floats  #: Sigma that `Config.largest_sigma_m` limits.
     phase: PhasePositions | None
 
 
@@ -193,7 +193,7 @@ def _published(
     variance = epoch_variance(scale, constrained.wsse, ranges.redundancy, limits=config.noise_scale)
     nominal, phase = _nominal_variance_m2(checked.model, corrected.nominal_elevation_sigma_m), None
     if config.carrier in ("float", "fixed"):
-        assert slips is not None, "found where the carrier phase is used"
+        assert slips is not None, "cycle slips are searched for if phases are used"
         of_all = slips
 
         def own_phase(
@@ -245,8 +245,8 @@ def _status(
 ) -> Codes:
     """Return the status of each epoch, shape (T,), by the most serious condition that applies.
 
-    `counts` has the numbers of used and of redundant ranges; `failed` has three masks: the ranges contradict the map,
-    the ranges are inconsistent, other positions are possible. The shapes are (T,).
+    `counts` has the numbers of used and of redundant ranges. `failed` has masks of epochs whose ranges contradict the
+    map, whose ranges are inconsistent, and that have other possible positions. The shapes are (T,).
     """
     off_map, inconsistent, open_elsewhere = failed
     (n_used, redundancy), constrained, section = counts, solution.fix.constrained, solution.fix.section

@@ -1,9 +1,9 @@
 """Process chunks of epochs, from observations to filter results.
 
-`EpochProcessor` contains the constant data of a run (settings, trajectories, error model). Its method `process`
-requires a chunk of observations, the other data received since the previous chunk, and the previous state. It returns
-every intermediate result and the new state. The results do not depend on the division into chunks; a live epoch is a
-chunk of length one.
+`EpochProcessor` contains the constant data of a run (settings, trajectories, error model). Its method `process` takes a
+chunk of observations, all other data received since the previous chunk, and the previous state. It returns every
+intermediate result and the new state. The results do not depend on the division into chunks; a live epoch is a chunk of
+length one.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class EpochProcessor:
         The files named in the configuration are not read; pass their contents, as
         `railfix.run.processor_setup.make_processor` does.
     trajectories : mapping of str to Trajectory
-        Trajectory of the antenna "front", of the antenna "rear", or of both.
+        Trajectories by name of the antenna: "front", "rear" or both.
     navigation : Navigation, optional
         Navigation records known from the start; further records can be passed with each chunk. If None, records must be
         passed with the first chunk, otherwise `process` raises `SettingsError`.
@@ -105,8 +105,8 @@ class EpochProcessor:
     Raises
     ------
     SettingsError
-        SBAS is combined with precise ephemerides, only one of `config.sbas` and `corrections` is given or their
-        frequencies differ, or an argument has a wrong type.
+        SBAS is combined with precise ephemerides; only one of `config.sbas` and `corrections` is given; their
+        frequencies differ; or an argument has a wrong type.
     ValueError
         The trajectories have different map sigmas, or a user-defined screen has the name of a built-in screen.
     """
@@ -123,7 +123,7 @@ class EpochProcessor:
         screens: Sequence[Screen[Any]] = (),
     ) -> None:
         if not (isinstance(trajectories, Mapping) and trajectories):
-            raise SettingsError("trajectories: pass one for each antenna, and at least one: {'front': trajectory}")
+            raise SettingsError("trajectories: pass one or more by name of the antenna: {'front': trajectory}")
         if unknown := sorted(set(trajectories) - {"front", "rear"}, key=str):
             raise SettingsError(f"trajectories: unknown antenna {unknown[0]!r}; the antennas are front and rear")
         models, stations = models or Models(), stations or Stations()
@@ -138,7 +138,7 @@ class EpochProcessor:
             check_type(navigation, Navigation, "navigation")
         check_corrections(config, corrections)
         if len({(t.sigma_plan_m, t.sigma_height_m) for t in trajectories.values()}) > 1:
-            raise ValueError("the antennas' trajectories have different map sigmas; they must be on one map")
+            raise ValueError("the antennas' trajectories have different map sigmas; they must be of one map")
         self.config = config
         plan, height = config.map_plan_sigma_m, config.map_height_sigma_m
         self.trajectories = {
@@ -205,7 +205,7 @@ class EpochProcessor:
         check_base(self.config, self._base)
         notes += error_model_notes(self._error_model, self.config)
         if self.config.protection == "on" and self.config.carrier in ("float", "fixed"):
-            notes.append("protection level: requested, but not available for positions from code and phase together")
+            notes.append("protection level: requested, but not available for positions from both code and phase")
         return tuple(notes)
 
     def process(
@@ -220,7 +220,8 @@ class EpochProcessor:
     ) -> tuple[Result, State]:
         """Return the positions of one chunk, and the state for the next chunk.
 
-        Each note and doubt of the result is also a `RailfixWarning`, except notes on default screens without input.
+        Notes and doubts in the result are also issued as `RailfixWarning`, except notes on default screens without
+        input.
 
         Parameters
         ----------
@@ -376,7 +377,7 @@ class EpochProcessor:
         Two antennas are filtered in two threads.
         """
         solution, interference = chunk.solution, dict(zip(chunk.names, chunk.interference, strict=True))
-        assert solution is not None, "single epochs are positioned before the filter"
+        assert solution is not None, "the filter needs the single-epoch positions of the chunk"
 
         def one_antenna(name: str) -> tuple[AlongTrack, tuple[Replay, ...], FilterState]:
             rows, sensors, line = chunk.rows[name], chunk.sensors, self.lines[name]
@@ -393,7 +394,7 @@ class EpochProcessor:
         return dict(zip(chunk.names, over_antennas(one_antenna, chunk.names), strict=True))
 
     def _curve_notes(self, headers: Mapping[str, ObservationHeader]) -> Iterator[str]:
-        """Yield a note for each log whose antenna or receiver differs from that of the C/N0 curve."""
+        """Yield a note for each log whose antenna or receiver is not the one of the C/N0 curve."""
         if (curve := self.setup.cn0_curve) is not None and "cn0" in self.config.screens:
             for name, header in headers.items():
                 yield from (f"{name}: {note}" for note in curve.notes_for(header))
@@ -415,7 +416,7 @@ class EpochProcessor:
 
 
 def _check_rising(name: str, time: Datetimes, before: AntennaState | None) -> None:
-    """Raise ValueError if an epoch is not after the preceding epoch in this chunk or in the state `before`."""
+    """Raise ValueError unless the epochs increase and begin after the last epoch of the state `before`."""
     if (back := (time[1:] <= time[:-1]).nonzero()[0]).size:
         earlier, later = time[back[0] : back[0] + 2]
         raise ValueError(f"{name}: epoch {back[0] + 1} ({later}) is not after {earlier}; pass epochs in order of time")

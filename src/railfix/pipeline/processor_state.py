@@ -27,13 +27,13 @@ from railfix.positioning.two_frequencies import TwoFrequencyState
 class AntennaState(NotebookTable):
     """State of one antenna after a chunk."""
 
-    noise: NoiseState = field(default_factory=NoiseState)  #: Sums for the noise scales.
-    map_offset: MapOffsetState = field(default_factory=MapOffsetState)  #: Sums for the test of the map.
-    lasting: LastingErrorState = field(default_factory=LastingErrorState)  #: Mean residuals of each satellite.
+    noise: NoiseState = field(default_factory=NoiseState)  #: State of the noise scales.
+    map_offset: MapOffsetState = field(default_factory=MapOffsetState)  #: State of the test of the map.
+    lasting: LastingErrorState = field(default_factory=LastingErrorState)  #: State of the test for persistent errors.
     off_map: OffMapState = field(default_factory=OffMapState)  #: State of the off-map test.
     offsets: OffsetState = field(default_factory=OffsetState)  #: Inter-system biases estimated so far.
-    screens: Mapping[str, Any] = field(default_factory=dict)  #: States of the screens with memory, by name.
-    carrier: CarrierState | None = None  #: State of the carrier-phase stages, if used.
+    screens: Mapping[str, Any] = field(default_factory=dict)  #: States of the screens that have one, by name.
+    carrier: CarrierState | None = None  #: State of the carrier-phase stages; None if unused.
     #: Time tag of the last epoch; NaT before the first epoch.
     ended: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     #: Mean differences of the satellites' two codes.
@@ -53,9 +53,9 @@ class State(NotebookTable):
     """State after a chunk: everything that the next chunk needs."""
 
     antennas: Mapping[str, AntennaState] = field(default_factory=dict)
-    #: Navigation records and SBAS messages so far; with None, the processor's initial data are used.
+    #: Navigation records and SBAS messages received so far; None stands for the processor's initial data.
     received: Received | None = None
-    base: BaseState | None = None  #: State of the base station.
+    base: BaseState | None = None  #: State of the base station; None without one.
     fusion: Mapping[str, FilterState] = field(default_factory=dict)  #: State of the filter along the track, by antenna.
 
     def __repr__(self) -> str:

@@ -38,11 +38,11 @@ class RangeErrorModel(Protocol):
         """Return the overbounding sigma and bias of observations, shape (T, K) [m]; NaN where unknown."""
 
     def missing_parts(self) -> tuple[str, ...]:
-        """Return a sentence for each part that is missing because an earlier version wrote the model."""
+        """Return a sentence for each part that the model lacks because an earlier version of railfix wrote it."""
 
 
 class Models(NamedTuple):
-    """Measured models: error model, C/N0 curve, and integrity support message of ARAIM levels."""
+    """Contents of model files: error model, C/N0 curve, and integrity support message for ARAIM levels."""
 
     error_model: RangeErrorModel | None = None
     cn0_curve: OpenSkyCn0 | None = None
@@ -76,7 +76,7 @@ def correct_ranges(
 
 
 def raw_ranges(obs: Observations, channels: Channels, satellites: SatelliteRanges) -> Ranges:
-    """Return the codes corrected for satellite clock and group delay, with equal weights."""
+    """Return equally weighted ranges: codes corrected for satellite clock and group delay."""
     code = np.where(satellites.reason == 0, obs.code_m[:, channels.columns] + satellites.correction_m, np.nan)
     sigma = np.full(code.shape, ANCHOR_SIGMA_M)
     return weighted_ranges(satellites.states.position_ecef_m, code, sigma, channels.clock)

@@ -19,19 +19,19 @@ from railfix.ranges.sources import BroadcastSource, CorrectionSource, choose_ion
 
 Records = TypeVar("Records", KeplerRecords, GlonassRecords)
 
-#: Element types in record tables, by the name of the array type (`railfix.core.arrays`).
+#: Element types of the fields of record tables; keys are names of array types (`railfix.core.arrays`).
 _ELEMENTS: Final[dict[str, Any]] = {
     "Strings": "<U3",
     "Datetimes": "datetime64[ns]",
     "Floats": np.float64,
     "Integers": np.int64,
 }
-#: Shapes of the two-dimensional fields of a table without rows.
+#: Shapes of two-dimensional fields in a record table without rows.
 _EMPTY: Final[dict[str, tuple[int, ...]]] = {
     **dict.fromkeys(("position_ecef_m", "velocity_ecef_mps", "acceleration_ecef_mps2"), (0, 3)),
     "inter_signal_s": (0, 6),
 }
-#: Fields that identify a Keplerian record.
+#: Fields by which Keplerian records are compared to find repeated ones.
 _KEPLER_KEY: Final = ("satellite", "message", "toe", "toc", "iode", "iodc", "health")
 _GLONASS_KEY: Final = ("satellite", "toe", "health")
 
@@ -45,7 +45,7 @@ def _no_records(kind: type[Records]) -> Records:
 
 
 def no_navigation() -> Navigation:
-    """Return navigation data without records, as known before the first message."""
+    """Return navigation data without records: the state before the first message."""
     return Navigation(kepler=_no_records(KeplerRecords), glonass=_no_records(GlonassRecords))
 
 
@@ -87,12 +87,12 @@ class Received:
     klobuchar: Floats | None = None
     #: Standard deviation of the vertical ionospheric delay if typical coefficients replace broadcast ones, otherwise 0.
     ionosphere_sigma_m: float = 0.0
-    notes: tuple[str, ...] = ()  #: One sentence on each replacement of requested data.
-    base: BaseErrors | None = None  #: Range errors measured by a base station.
+    notes: tuple[str, ...] = ()  #: Notes, one for each kind of requested data that was replaced.
+    base: BaseErrors | None = None  #: Range errors measured by a base station; None without one.
 
 
 def broadcast_source(received: Received, config: Config) -> BroadcastSource:
-    """Return the source of corrections from records and models only."""
+    """Return the source of corrections from navigation records and delay models alone."""
     return BroadcastSource(
         navigation=received.navigation, klobuchar=received.klobuchar, ionosphere_sigma_m=received.ionosphere_sigma_m,
         troposphere=config.troposphere, nominal=config.nominal,
@@ -118,7 +118,7 @@ def with_base_station(source: CorrectionSource, received: Received, config: Conf
 def known_from_start(
     config: Config, *, navigation: Navigation | None = None, corrections: MessageCorrections | None = None
 ) -> Received:
-    """Return the data known before the first epoch: all data when files are read, none on a running train.
+    """Return the data known before the first epoch: all data in post-processing, none in real time on the train.
 
     Raise SettingsError if SBAS is combined with precise ephemerides.
     """
@@ -130,7 +130,7 @@ def check_corrections(config: Config, corrections: MessageCorrections | None) ->
     if bool(config.sbas) != (corrections is not None):
         given, state = "not given" if corrections is None else "given", "on" if config.sbas else "off"
         raise SettingsError(
-            f"SBAS is {state} in the settings (sbas), but its corrections were {given}; give both: "
+            f"SBAS is {state} in the settings (sbas), but SBAS corrections were {given}; give both: "
             "Config(sbas='stream', sbas_prn=137), EpochProcessor(..., corrections=SbasState(prn=137))"
         )
     if corrections is not None and corrections.dual_frequency != config.dual_frequency_sbas:
@@ -146,13 +146,13 @@ def receive(
     navigation: Navigation | None = None,
     messages: Any = None,
 ) -> Received:
-    """Return the received data after new navigation records and messages; return `before` if there are none.
+    """Add new navigation records and messages to the received data; return `before` itself if there are none.
 
     `time` is the time of the next epoch, NaT if unknown. Messages that no epoch from `time` on can use are dropped.
-    Repeated and expired records are dropped as well, except for a satellite's newest record. Newer coefficients and
-    precise ephemerides replace the older ones. With SBAS, every satellite is rejected until its corrections are
-    complete. Raise SettingsError if SBAS is combined with precise ephemerides, if the messages do not match the
-    corrections, or if messages are given without corrections.
+    Repeated and expired records are dropped as well, except for a satellite's newest record. Newer ionospheric
+    coefficients and precise ephemerides replace older ones. With SBAS, every satellite is rejected until its
+    corrections are complete. Raise SettingsError if SBAS is combined with precise ephemerides, if the messages do not
+    match the corrections, or if messages are given without corrections.
     """
     if navigation is None and messages is None:
         return before
@@ -163,7 +163,7 @@ def receive(
     if messages is not None:
         if before.corrections is None:
             raise SettingsError(
-                "messages were given, but SBAS is off: Config(sbas='stream', sbas_prn=137), "
+                "messages were given, but SBAS is off; turn it on: Config(sbas='stream', sbas_prn=137), "
                 "EpochProcessor(..., corrections=SbasState(prn=137))"
             )
         corrections = before.corrections.add_messages(messages)
@@ -231,7 +231,7 @@ def _with_ionosphere(received: Received, config: Config) -> Received:
         modelled = _with_ionosphere(replace(received, corrections=None), config)
         note = (
             f"ionosphere: {config.ionosphere}, frequencies: {config.frequencies} requested, ionosphere-free codes used "
-            f"instead; troposphere: {config.troposphere} requested, SBAS model used"
+            f"instead; troposphere: {config.troposphere} requested, SBAS model used instead"
         )
         return replace(modelled, corrections=received.corrections, notes=(note,))
     if received.corrections is not None:

@@ -46,9 +46,9 @@ class Column(Generic[Source]):
 
     name: str  #: Name, ending with the unit if there is one: ``along_sigma_m``.
     meaning: str
-    #: Where the source of a table has the values: an attribute path (``raim.statistic``; by default the name) or a
-    #: function of the source; None if the source lacks them. The values are an array with epochs on axis 0, or one
-    #: value for all rows. If the column has `words`, the values are indices of words.
+    #: How to get the values from the source of a table: an attribute path (``raim.statistic``; by default the column's
+    #: name), a function of the source, or None if the source lacks the values. The values are an array with epochs on
+    #: axis 0, or one value for all rows. If the column has `words`, the values are indices of words.
     values: str | Callable[[Source], NDArray[Any] | str | None] | None = ""
     dtype: pl.DataType = field(default=pl.Float64(), kw_only=True)
     words: tuple[str, ...] = field(default=(), kw_only=True)  #: Words to which integer values refer, by index.
@@ -102,7 +102,7 @@ def by_name(columns: Iterable[Column[Source]]) -> dict[str, Column[Source]]:
 
 
 def of_one_meaning(meaning: str, **values: str | Callable[[Any], NDArray[Any] | None]) -> Iterator[Column[Any]]:
-    """Return float columns that share one meaning, each with values of its own."""
+    """Return float columns that have the same description but different values."""
     return (Column(name, meaning, source) for name, source in values.items())
 
 
@@ -150,7 +150,7 @@ class Observed:
         return self.on_all_channels(None if self.tracked is None else self.tracked.tracked.innovation[:, kind])
 
 
-#: Columns that the tables of positions and of the filter share: epoch, line and position.
+#: Columns of epoch, place on the line and position in space, in both the positions' and the filter's table.
 EPOCH: Final[tuple[Column[Any], ...]] = (
     Column("time_gpst", "time tag of the receiver, GPS time", "time", dtype=pl.Datetime("ns")),
     Column("antenna", "`front` or `rear`", None, dtype=pl.String()),
@@ -173,7 +173,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         *EPOCH,
         Column("status", "see `railfix.core.reasons.Status`", words=tuple(s.text for s in Status)),
         *ON_LINE,
-        Column("along_sigma_m", "standard deviation along the line, including unresolved alternative positions"),
+        Column("along_sigma_m", "standard deviation along the line, larger if alternative positions are unresolved"),
         Column(
             "own_sigma_m",
             "single-epoch sigma, computed from the codes of the epoch alone; the status is `uncertain` above "
@@ -195,7 +195,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
             "sum of squared residuals before any exclusion / noise variance (with the fixed limit: the sum in m^2)",
             "raim.statistic",
         ),
-        Column("raim_scale", "noise scale of the statistic, from consistent ranges of earlier epochs", "raim.scale"),
+        Column("raim_scale", "noise scale that `raim_statistic` assumes, from consistent earlier ranges", "raim.scale"),
         Column("raim_threshold", "threshold of the statistic, above which a fault is detected", "raim.threshold"),
         Column(
             "raim_level_m",
@@ -211,12 +211,12 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "integer_risk_ppm",
-            "probability that a fixed integer is wrong or, where none is fixed, that a best candidate is wrong [1e-6]",
+            "probability that any fixed integer is wrong or, if none is fixed, that any best candidate is wrong [1e-6]",
             lambda r: None if r.phase is None else 1e6 * r.phase.integer_risk,
         ),
         Column(
             "protection_level_m",
-            "bound that the error along the line exceeds only with the stated risk; infinite for the reason given by "
+            "bound that the error along the line exceeds at most with the stated risk; infinite for the reason in "
             "`protection_cause`, empty where a fault remains",
             "protection.level.level_m",
         ),
@@ -226,13 +226,13 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
             "protection.level.fault_free_m",
         ),
         *of_one_meaning(
-            "protection level for faults of one satellite, and of two satellites; 0 where these faults are less "
-            "probable than the risk allocated to them",
+            "protection level for one fault, or for two faults, as in the column's name; 0 if the probability of such "
+            "faults is below the risk allocated to them",
             protection_one_fault_m="protection.level.one_fault_m",
             protection_two_faults_m="protection.level.two_fault_m",
         ),
         *of_one_meaning(
-            "factor K of the protection level for no, one and two faults",
+            "multiplier K of sigma in the protection level for no, one or two faults, as in the column's name",
             protection_k_fault_free="protection.level.k_fault_free",
             protection_k_one_fault="protection.level.k_one_fault",
             protection_k_two_faults="protection.level.k_two_faults",
@@ -259,15 +259,15 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
             "largest contribution to the level: `fault_free`, `one_fault`, `two_faults`, `three_faults` or more; or "
             "the reason for a missing level: `unchecked`, `unchecked_constellation`, `unchecked_side`, "
             "`unchecked_map`, "
-            "`unchecked_together` (faults that nothing checks), `budget`, `unbounded`, "
+            "`unchecked_together` (all `unchecked`: faults that cannot be detected), `budget`, `unbounded`, "
             "`no_position`",
             "protection.level.cause",
             words=tuple(c.name.lower() for c in Cause),
         ),
         Column(
             "protection_status",
-            "`available`: level within the alarm limit; `unavailable`: larger level or doubtful position; `alarm`: the "
-            "ranges contradict the level, or a check has failed",
+            "`available`: level within the alarm limit; `unavailable`: larger level or doubtful position; `alarm`: a "
+            "solution separation exceeds its threshold, or a check has failed",
             "protection.status",
             words=tuple(s.name.lower() for s in LevelStatus),
         ),
@@ -289,8 +289,8 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         *_screen_columns("positions", _get_screened),
         Column(
             "conventional_status",
-            "3-D single point: `valid`, `no_position`, `residuals` beyond noise (chi-square test), "
-            "`dilution` over its limit",
+            "3-D single point: `valid`, `no_position`, `residuals` (too large, chi-square test), "
+            "`dilution` (over its limit)",
             words=tuple(s.name.lower() for s in PointStatus),
         ),
         Column("conventional_chainage_m", "3-D single point, moved to the nearest point of the trajectory"),
@@ -300,9 +300,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
             "mean offset to the right of the line, facing rising chainage, of the 3-D positions of the last minutes",
             "map_offset.across_m",
         ),
-        Column(
-            "map_offset_up_m", "mean height of the 3-D positions of the last minutes above the line", "map_offset.up_m"
-        ),
+        Column("map_offset_up_m", "mean height above the line of the last minutes' 3-D positions", "map_offset.up_m"),
         *of_one_meaning(
             "smallest offset, across and up, that the test for the status `map_offset` detects with 99 % probability",
             map_detectable_across_m=lambda r: r.map_offset.detectable_m[:, 0],
@@ -363,8 +361,8 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
         *_screen_columns("observations", _get_screened_channels),
         Column(
             "second_share",
-            "two frequencies: weight of the second code; negative toward the ionosphere-free combination; empty if the "
-            "first code is used alone",
+            "two frequencies: weight of the second code; negative if it reduces ionospheric errors; "
+            "empty if the first code is used alone",
             lambda o: _second(o, lambda r, _: r.share),
         ),
         Column(
@@ -384,7 +382,7 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
         ),
         Column(
             "raim_own_error_m",
-            "screen `raim`: error of a faulty satellite's range relative to all other ranges; empty where the "
+            "screen `raim`: error of a faulty satellite's range, estimated from all other ranges; empty if the "
             "robust fit rejected the range",
             lambda o: o.on_all_channels(o.result.raim.own_error_m),
         ),
@@ -395,7 +393,7 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
             lambda o: o.innovation(Kind.CODE),
         ),
         *of_one_meaning(
-            "filter along the track: innovation of the carrier-phase change, and of the Doppler",
+            "filter along the track: measured minus predicted carrier-phase change, or Doppler, as in the name",
             innovation_phase_m=lambda o: o.innovation(Kind.PHASE),
             innovation_doppler_mps=lambda o: o.innovation(Kind.DOPPLER),
         ),

@@ -56,7 +56,7 @@ def in_time_order(parts: Sequence[pl.DataFrame]) -> pl.DataFrame:
 
 
 def positions_table(result: Result) -> pl.DataFrame:
-    """Return `POSITION_COLUMNS`, one row per epoch and antenna, in order of time and then of `result.antennas`."""
+    """Return `POSITION_COLUMNS`, one row per epoch and antenna, sorted by time, then as in `result.antennas`."""
     check_type(result, Result, "result")
     parts = [antenna_positions(name, antenna) for name, antenna in result.antennas.items()]
     return in_time_order(parts)
@@ -113,8 +113,8 @@ def to_xarray(
     xarray.Dataset
         Variables over ``time`` for `POSITION_COLUMNS` and, with `tracked`, for `TRAIN_COLUMNS` (``filter_...``);
         variables over ``time`` and ``channel`` for `CHANNEL_COLUMNS`. Each has ``units`` and a ``long_name``. Positions
-        are also in ``ecef_m`` and ``conventional_ecef_m`` over ``xyz``, and in ``arc_m`` along the trajectory.
-        ``satellite`` and ``signal`` are coordinates of ``channel``.
+        are also given as ECEF coordinates ``ecef_m`` and ``conventional_ecef_m`` (axis ``xyz``), and as arc length
+        ``arc_m`` along the trajectory. ``satellite`` and ``signal`` are coordinates of ``channel``.
     """
     import xarray as xr
 
@@ -175,7 +175,7 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         *ON_LINE,
         Column(
             "along_sigma_m",
-            "standard deviation of the position, including the straight distance to other branches",
+            "standard deviation of the position; larger if positions on other branches are possible",
             "tracked.sigma_m",
         ),
         Column("speed_mps", "speed along the line, + toward rising chainage", "tracked.speed_mps"),
@@ -196,8 +196,8 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         Column("hypotheses", "number of possible positions", "tracked.hypotheses", dtype=pl.Int16()),
         Column(
             "protection_level_m",
-            "bound that the error along the line exceeds only with the stated risk; infinite where another position is "
-            "more probable than the risk, or measurements contradict the position",
+            "bound that the error along the line exceeds at most with the stated risk; infinite if the probability of "
+            "other positions exceeds this risk, or if measurements contradict the position",
             "tracked.level_m",
         ),
         Column(
@@ -205,8 +205,8 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
             "protection level of the straight distance from position to train; also valid on other laps or off the map",
             "tracked.ground_level_m",
         ),
-        Column("protection_noise_m", "part of the protection level for fault-free noise", "tracked.level_noise_m"),
-        Column("protection_separation_m", "largest separation of a sub-filter from the filter", "tracked.separation_m"),
+        Column("protection_noise_m", "part of the protection level due to noise alone", "tracked.level_noise_m"),
+        Column("protection_separation_m", "largest difference of a sub-filter from the filter", "tracked.separation_m"),
         Column(
             "protection_unchecked",
             "probability of faults that the level does not bound: a fault of the only constellation in view",
@@ -218,7 +218,7 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
             "distance since codes were last used (`L_DOUBTOVER` minus `Q_LOCACC`)",
             "tracked.amount_m",
         ),
-        Column("under_reading_m", "largest distance of the train ahead (`L_DOUBTUNDER`)", "tracked.amount_m"),
+        Column("under_reading_m", "largest distance of the train ahead of the position", "tracked.amount_m"),
         Column(
             "motion",
             "state of motion from tachometer and inertial unit together, see `docs/sensors.md`",
@@ -244,23 +244,23 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
         Column("force_offset_mps2", "estimated offset of the accelerometer", "tracked.force_offset_mps2"),
         Column(
             "map_scale",
-            "factor on the map's length error of 0.03 m per root metre; above 1 if pseudoranges indicate larger errors",
+            "factor on the map's assumed length error (0.03 m per root metre); above 1 if pseudoranges indicate more",
             "tracked.map_scale",
         ),
         Column(
             "measured_chainage_m",
-            "chainage of the vehicle's middle, or of the antenna, to which the next three columns refer",
+            "chainage, of the vehicle's middle or (without vehicle file) of the antenna, for the next three columns",
             "sensed.under_m",
         ),
         Column(
             "measured_gradient_permille",
-            "gradient from tachometer and accelerometer, positive if the line rises with chainage; empty in slips "
-            "and below 1 m/s",
+            "gradient from tachometer and accelerometer, positive if the line rises with chainage; empty "
+            "during slips and below 1 m/s",
             lambda r: 1e3 * r.sensed.gradient,
         ),
         Column(
             "measured_curvature_1pm",
-            "curvature at `measured_chainage_m` from the yaw rate, positive to the right in rising chainage",
+            "curvature at `measured_chainage_m` from yaw rate, positive if the line turns right toward rising chainage",
             "sensed.curvature_1pm",
         ),
         Column(
@@ -306,12 +306,12 @@ class SmoothedAntenna:
     trajectory: Trajectory
 
 
-#: Columns added by smoothing (`railfix run --smooth`).
+#: Columns that smoothing adds to the filter's table (`railfix run --smooth`).
 SMOOTHED_COLUMNS: Final[Mapping[str, Column[SmoothedAntenna]]] = by_name(
     (
         Column(
             "smoothed_chainage_m",
-            "smoothed chainage, from all measurements before and after the epoch",
+            "smoothed chainage, computed from all measurements before and after the epoch",
             lambda s: s.trajectory.chainage_at(on_line_m(s.track, s.trajectory)),
         ),
         Column("smoothed_sigma_m", "standard deviation of the smoothed chainage", "track.sigma_m"),
@@ -331,7 +331,7 @@ def train_table(result: Result) -> pl.DataFrame:
 
 
 def with_smoothed(table: pl.DataFrame, smoothed: Mapping[str, pl.DataFrame]) -> pl.DataFrame:
-    """Add `SMOOTHED_COLUMNS` to rows of `train_table`; `smoothed` has these columns by antenna, in order of time."""
+    """Add `SMOOTHED_COLUMNS` to rows of `train_table`; `smoothed` has them for each antenna, in order of time."""
     antenna = table["antenna"].to_numpy()
     values = {name: np.full(len(table), np.nan) for name in SMOOTHED_COLUMNS}
     for name, rows in smoothed.items():
@@ -359,20 +359,20 @@ def _getter(name: str) -> Any:
     return lambda passings: np.array([getattr(passing, name) for passing in passings])
 
 
-#: Columns of the table of passings.
+#: Columns of the table of passed balises and virtual balises, and of wrong readings.
 PASSING_COLUMNS: Final[Mapping[str, Column[Sequence[Passing]]]] = by_name(
     (
         Column("time_gpst", "time of the passing from the filter, or time of a contradicting reading", _getter("time"),
                dtype=_TIME),
-        Column("earliest_gpst", "earliest time of the passing that the protection level allows",
+        Column("earliest_gpst", "earliest time, within the protection level, of the passing",
                _getter("earliest"), dtype=_TIME),
-        Column("latest_gpst", "latest time of the passing that the protection level allows",
+        Column("latest_gpst", "latest time, within the protection level, of the passing",
                _getter("latest"), dtype=_TIME),
         EPOCH[1],
         Column("balise", "name in the list, or identity that was read", _getter("balise"), dtype=pl.String()),
         Column(
             "verdict",
-            "`virtual`: virtual balise passed; `read`: balise passed with a reading; `missing`: passed without one; "
+            "`virtual`: virtual balise passed; `read`: balise passed with a reading; `missing`: passed unread; "
             "`contradicts`: read at a place that the filter excludes; `not_listed`: read, but not in the list",
             _getter("verdict"), words=VERDICTS,
         ),
@@ -384,7 +384,7 @@ PASSING_COLUMNS: Final[Mapping[str, Column[Sequence[Passing]]]] = by_name(
         Column("protection_level_m", "protection level of the position at the passing", _getter("level_m")),
         Column("doubt_over_m", "largest distance of the train behind the position: `L_DOUBTOVER` minus `Q_LOCACC`",
                _getter("amount_m")),
-        Column("doubt_under_m", "largest distance of the train ahead: `L_DOUBTUNDER` minus `Q_LOCACC`",
+        Column("doubt_under_m", "largest distance of the train ahead of the position: `L_DOUBTUNDER` minus `Q_LOCACC`",
                _getter("amount_m")),
         Column("odometer_m", "for comparison: 5 m plus 5 % of the distance since the last balise read (SUBSET-041)",
                _getter("odometer_m")),

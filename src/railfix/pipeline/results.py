@@ -30,13 +30,13 @@ from railfix.track.trajectory import Trajectory
 class AntennaResult(Solution, LineCoordinates, NotebookTable):
     """Positions and intermediate results of one antenna at T epochs.
 
-    Arrays of `corrected` have K channels, which are those that the settings allow. Properties have M channels, which
-    are all observed channels of all antennas that were processed together.
+    Arrays of `corrected` have the K channels that the settings allow. Properties of the class have M channels: all
+    observed channels of all antennas that were processed together.
     """
 
     trajectory: Trajectory  #: Trajectory of the antenna.
     corrected: CorrectedRanges  #: Corrected ranges with all rejection reasons.
-    combined: Combined | None  #: Combination of the codes of two frequencies.
+    combined: Combined | None  #: Combined codes of two frequencies; None with one frequency.
     #: Metric and verdict of each active screen, by name, shape (T, K); "antenna_spacing", a position screen, has shape
     #: (T,).
     screens: Mapping[str, Screened]
@@ -87,7 +87,7 @@ class AntennaResult(Solution, LineCoordinates, NotebookTable):
     @property
     def n_rejected(self) -> Integers:
         """Number of satellites with a code but no used signal, shape (T,)."""
-        of_satellite = self.corrected.channels.member.astype(np.float32)  # float products are computed in blocks
+        of_satellite = self.corrected.channels.member.astype(np.float32)  # floats, as their matrix product is faster
         seen = ((self.reason & Reason.NOT_OBSERVED) == 0).astype(np.float32) @ of_satellite > 0
         used = (self.reason == 0).astype(np.float32) @ of_satellite > 0
         return np.asarray((seen & ~used).sum(axis=1), dtype=np.int64)
@@ -125,7 +125,7 @@ class AntennaResult(Solution, LineCoordinates, NotebookTable):
 
     @property
     def residual_m(self) -> Floats:
-        """Residuals of the position on the line, NaN for unused ranges, shape (T, M)."""
+        """Residuals of the ranges at the position on the line, NaN for unused ranges, shape (T, M)."""
         residual = self.fix.constrained.residual_m
         return self.on_all_channels(np.where(self.corrected.reason == 0, residual, np.nan))
 
@@ -165,7 +165,7 @@ class AntennaResult(Solution, LineCoordinates, NotebookTable):
 
 
 def antenna_results(chunk: Chunk, fusion: Mapping[str, AlongTrack], config: Config) -> dict[str, AntennaResult]:
-    """Return the single-epoch results by antenna; positions are NaN where the final status drops them.
+    """Return the single-epoch results by antenna; positions are NaN at epochs whose final status requires it.
 
     If the filter along the track is on, its comparison with wheel distances can add a sign of interference.
     """
@@ -231,7 +231,7 @@ class Result(NotebookTable):
                 )
                 yield f"{name}: no epoch has a position: {cause}"
             elif 2 * np.count_nonzero(off) > np.count_nonzero(observed):
-                yield f"{name}: most positions contradict the map; is this the track of the log?"
+                yield f"{name}: most positions contradict the map; was the log recorded on this track?"
 
     def __repr__(self) -> str:
         parts = (

@@ -98,7 +98,7 @@ def screen_positions(
 ) -> tuple[Codes, dict[str, dict[str, Screened]]]:
     """Apply the screens that compare the positions of two antennas; return the statuses (T,), and verdicts by antenna.
 
-    A rejection sets the screen's status on both antennas.
+    If a screen rejects an epoch, the positions of both antennas get the status of this screen.
     """
     status, judged = solution.status.copy(), {name: dict[str, Screened]() for name in rows}
     if pair is None or not screens:

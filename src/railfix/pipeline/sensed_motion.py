@@ -35,11 +35,11 @@ from railfix.motion.tachometer import (
 from railfix.pipeline.passed_features import SLOWEST_MPS, RateSeries
 from railfix.track.trajectory import Trajectory
 
-#: Sample spacing of the slip detection [ns]; samples are at multiples of this spacing in GPS time.
+#: Sample interval of the slip detection [ns]; sample times are multiples of this interval in GPS time.
 _TICK_NS: Final = 20_000_000
 #: Averaging time of wheel accelerations and inertial means [ns].
 _MEAN_NS: Final = 200_000_000
-#: Time for which a lost or doubled pulse disturbs the wheel acceleration [ns].
+#: The wheel acceleration is not used for this time after a lost or doubled pulse [ns].
 _FAULT_NS: Final = _MEAN_NS + 150_000_000
 #: The next chunk needs the samples of this interval before the last epoch.
 REACH: Final = np.timedelta64(_MEAN_NS + 200_000_000, "ns")
@@ -50,7 +50,7 @@ CARRIED: Final = (
     MotionState.INERTIAL_SPIN,
     MotionState.INERTIAL_SLIDE,
     MotionState.ROLLING,
-)  # The state of an interval is the most informative of the states of its samples.
+)  # The state of an interval is the sample state with the highest `_RANK`.
 _RANK: Final = np.array(
     [
         {
@@ -67,16 +67,16 @@ _RANK: Final = np.array(
 class SensedMotion:
     """Motion in T intervals between epochs; forward is the direction in which the vehicle's front points."""
 
-    state: Codes  #: `railfix.motion.slip.MotionState`; INIT without both sensors; shape (T,).
-    distance_m: Floats  #: Forward distance by inertia where the state is one of `CARRIED`, NaN elsewhere; shape (T,).
-    doubt_mps: Floats  #: Largest slip speed that an undetected slip can have, shape (T,).
+    state: Codes  #: `railfix.motion.slip.MotionState`; INIT unless there are both sensors; shape (T,).
+    distance_m: Floats  #: Forward distance by inertia if the state is one of `CARRIED`, else NaN; shape (T,).
+    doubt_mps: Floats  #: Largest slip speed that can be undetected, shape (T,).
     #: Part of the mean forward specific force due to pitching of the body, 0 without a gyro; shape (T,).
     swing_mps2: Floats
-    #: Gradient of the line under the body toward rising arc length, from wheel and accelerometer (P2 2.3); an
-    #: accelerometer offset of 0.01 m/s2 causes an error of 0.001. The gradient and the next three fields are NaN unless
-    #: the wheel rolls without slip and faster than `SLOWEST_MPS`; shape (T,) each.
+    #: Gradient of the line under the body, positive if the line rises with arc length, from wheel and accelerometer (P2
+    #: 2.3); an accelerometer offset of 0.01 m/s2 causes an error of 0.001. The gradient and the next three fields are
+    #: NaN unless the wheel rolls without slip and faster than `SLOWEST_MPS`; shape (T,) each.
     gradient: Floats
-    curvature_1pm: Floats  #: Curvature from the yaw rate, positive to the right toward rising arc length.
+    curvature_1pm: Floats  #: Curvature from the yaw rate, positive if the line turns right toward rising arc length.
     #: Cant between the wheels' contact points, from the roll of the body; positive if the left rail is higher; NaN
     #: without a vehicle.
     cant_m: Floats
@@ -88,9 +88,9 @@ class SensedState:
     """State of the sensed motion after a chunk."""
 
     tick: int = 0  #: Time tag of the last sample (`time`) in units of `_TICK_NS`; 0 before the first sample.
-    #: Antenna position at that sample, by dead reckoning with the wheel from the last filter position; NaN if unknown.
+    #: Antenna position at the last sample, dead-reckoned with the wheel from the last filter position; NaN if unknown.
     arc_m: float = float("nan")
-    sigma_m: float = float("nan")  #: Standard deviation of that filter position.
+    sigma_m: float = float("nan")  #: Standard deviation of the filter position where dead reckoning began.
     slip: SlipState | None = None
 
     @property
@@ -100,7 +100,7 @@ class SensedState:
 
 
 def nothing_sensed(intervals: int) -> SensedMotion:
-    """Return the motion without sensors."""
+    """Return the result for a train without sensors."""
     distance, gradient, curvature, cant, under = np.full((5, intervals), np.nan)
     doubt, swing = np.zeros((2, intervals))
     return SensedMotion(
@@ -147,8 +147,8 @@ def sensed_motion(
     distances = distance_m(pulses, np.concatenate([[start], when]), limits=tachometer)
     arc = state.arc_m + facing * (distances[1:] - distances[0])
     line_sine = facing * sine_at(arc)
-    # the speed by pulses refers to the middle of the pulse interval. Without the correction by `ago`, the delay would
-    # be 0.065 s, or 0.2 m after a slip of 3 s at 1 m/s2.
+    # the speed from pulses is valid at the middle of the pulse interval. Without the correction by `ago`, it would be
+    # late by 0.065 s, which causes an error of 0.2 m in a slip of 3 s at 1 m/s2.
     ago = seconds(when - speed.time)
     found, slip = find_slips(
         MotionSamples(
@@ -197,7 +197,7 @@ def _slope_and_bend(sine: Floats, turned_radps: Floats, speed_mps: Floats) -> tu
 def _wheel_acceleration(
     pulses: TachometerPulses, ticks: Integers, speed: PulseSpeeds, limits: TachometerLimits
 ) -> Floats:
-    """Return the wheel acceleration at the ticks; NaN after a lost tooth, so that it does not count as a slip."""
+    """Return the wheel acceleration at the ticks; NaN after a lost tooth, to avoid that it counts as a slip."""
     when, earlier, before = ((ticks * _TICK_NS - ago).astype("datetime64[ns]") for ago in (0, _MEAN_NS, _FAULT_NS))
     acceleration = pulse_acceleration(pulse_speeds(pulses, earlier, limits=limits), speed)
     return np.where(faults_until(pulses, when) > faults_until(pulses, before), np.nan, acceleration)
@@ -215,7 +215,7 @@ def _means(inertial: InertialSamples, begin: Datetimes, end: Datetimes) -> Float
 def _by_interval(
     state: Codes, speed_mps: Floats, doubt_mps: Floats, swing_mps2: Floats, under: Floats, at: Integers, span_s: Floats
 ) -> SensedMotion:
-    """Group samples by interval; `at` has the index of the first sample after each instant (first value 0).
+    """Group samples by interval; `at` has the index of the first sample after each interval limit (first value 0).
 
     `under` has gradient, curvature, cant and the antenna's arc length, shape (4, N).
     """

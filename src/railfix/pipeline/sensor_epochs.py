@@ -32,13 +32,13 @@ from railfix.tracking import RangeEpochs, SensorEpochs
 
 #: No distance and no mean force is computed for longer intervals between epochs than this [s].
 _LONGEST_S: Final = 5.0
-#: Minimum fraction of an interval's samples that must be finite for a mean.
+#: An interval has a mean only if at least this fraction of its samples is finite.
 _COMPLETE: Final = 0.9
 #: Standard deviation of the inertial speed during a slip, a stop or a start [m/s].
 _CARRY_SIGMA_MPS: Final = 0.1
-#: Standard deviation of the gradient over one metre: 1 mrad, due to pitch oscillations of the body.
+#: Standard deviation of the gradient's mean over one metre: 1 mrad, due to pitch oscillations of the body.
 _GRADIENT_NOISE: Final = 1e-3
-#: Standard deviation of the curvature over one metre, due to oscillations of the body's heading [1/m].
+#: Standard deviation of the curvature's mean over one metre, due to oscillations of the body's heading [1/m].
 _CURVATURE_NOISE_1PM: Final = 1e-4
 #: Correlation length of map errors [m], equal to `railfix.kernels.tracking.constants.MAP_CORRELATION_M`. With map
 #: errors of 0.3 m, features are located to some metres at best; with map errors of 0.05 m, to half a metre.
@@ -56,7 +56,7 @@ class LineReferences:
     balises: ListedBalises | None = None
 
 
-#: Minimum standard deviation of a two-way range [m]. P2 3.3 measured 0.19 to 0.24 m; the value is larger because of
+#: Minimum standard deviation of a two-way range [m]. P2 3.3 measured 0.19 to 0.24 m; this minimum is larger because of
 #: echoes and drifts of the unit's reply delay.
 _RANGE_SIGMA_M: Final = 0.5
 
@@ -73,10 +73,10 @@ class SensorLimits(Settings):
     range_above_m: float = 0.0  #: Height of the vehicle's ranging unit above the antenna.
 
     balise: BaliseLimits = Field(default_factory=BaliseLimits)
-    #: After an outage, codes are used again when three consecutive positions are within this number of sigmas of the
-    #: dead-reckoned position.
+    #: After an outage, codes are used again when three consecutive single-epoch positions are within this number of
+    #: sigmas of the dead-reckoned position.
     return_sigmas: float = Field(default=4.0, gt=0)
-    #: Longest time for which codes are withheld after an outage.
+    #: After an outage, codes are used again after this time in any case.
     return_s: float = Field(default=60.0, ge=0)
     #: Standard deviation of a distance between two epochs due to creep of a braked or driven wheel, in addition to the
     #: pulse quantisation.
@@ -112,7 +112,7 @@ def with_samples(state: SensorState, samples: SensorSamples | None) -> SensorSta
 
 
 def waiting_samples(state: SensorState, samples: SensorSamples) -> SensorState:
-    """Return the state of an antenna without an epoch, with the samples for its next epoch."""
+    """Return the state of an antenna that has no epoch in this chunk; the samples are kept for its next epoch."""
     state = with_samples(state, samples)
     newest = max(rows.time[-1] for rows in state.samples.tables.values() if len(rows))
     oldest = newest - REACH - timedelta(np.asarray(_LONGEST_S))
@@ -134,9 +134,9 @@ def sensor_epochs(
     state.
 
     `samples` has the samples since the previous chunk; `time` has the antenna's epochs, shape (T,). The trajectory
-    determines the direction of the front; `sine_at` returns the sine of the gradient at arc lengths (None if the line
-    is unknown). `sources` has the requested names among `wheel`, `radar`, `force`, `feature`, `balise` and `range`;
-    `references` has features of the line, ground units and listed balises.
+    determines the direction of the front; the function `sine_at`, None for an unknown line, returns the sine of the
+    gradient at arc lengths. `sources` has the requested names among `wheel`, `radar`, `force`, `feature`, `balise` and
+    `range`; `references` has features of the line, ground units and listed balises.
     """
     if not (samples or state.samples):
         last = time[-1] if len(time) else state.time
@@ -202,9 +202,9 @@ def sensor_epochs(
 def _wheel_values(
     pulses: TachometerPulses, edges: Datetimes, sensed: SensedMotion, limits: SensorLimits, *, known: Masks
 ) -> dict[str, Any]:
-    """Return the forward wheel distances of the intervals, their sigmas, and whether their sign is measured.
+    """Return the forward wheel distances of the intervals, their sigmas, and whether the direction was measured.
 
-    The distances are taken from pulses where the pulses are `known` and usable, and from the inertial unit in the
+    The distances are computed from pulses if these are usable and marked in `known`, and from the inertial unit in the
     states `CARRIED`; otherwise they are NaN.
     """
     span = seconds(np.diff(edges))
@@ -244,8 +244,8 @@ def _latest_samples(samples: SensorSamples, end: np.datetime64, limits: SensorLi
 def _with_map(trajectory: Trajectory) -> tuple[float, float]:
     """Return the standard deviations of gradient and curvature over one metre, map errors included.
 
-    A lateral map error sigma over a length L causes curvature errors of ``sqrt(3) sigma / L^2``, correlated over about
-    L; expressed as white noise over one metre, they are larger by ``sqrt(L)``. The gradient error is ``sigma / L``.
+    A map error sigma over a length L causes curvature errors ``sqrt(3) sigma / L^2`` and gradient errors ``sigma / L``,
+    both correlated over about L. The equivalent white noise over one metre is larger by the factor ``sqrt(L)``.
     """
     gradient = trajectory.sigma_height_m / np.sqrt(_MAP_LENGTH_M)
     curvature = np.sqrt(3.0) * trajectory.sigma_plan_m / _MAP_LENGTH_M**1.5
@@ -289,7 +289,7 @@ def _ranges(ranging: StationRanges, edges: Datetimes, units: GroundUnits, lever_
 
 
 def _find_first_needed(pulses: TachometerPulses, end: np.datetime64, limits: SensorLimits) -> int:
-    """Return the first pulse needed for speeds after an instant."""
+    """Return the index of the first pulse that speeds after `end` require."""
     last = int(np.searchsorted(pulses.time, end, side="right")) - 1
     if last < 1:
         return 0

@@ -22,7 +22,7 @@ from railfix.tracking import (
     track,
 )
 
-#: Largest number of epochs whose covariances are in memory at the same time.
+#: The covariances of at most this number of epochs are in memory at the same time.
 _EPOCHS: Final = 300
 
 
@@ -43,7 +43,7 @@ def smooth(backward: Iterable[Replay], line: Line, limits: TrackingLimits) -> Sm
 
 
 def _pieces(replay: Replay, line: Line, limits: TrackingLimits) -> list[tuple[GnssEpochs, TrackState | None]]:
-    """Split filter input into short pieces, each with the state before it; input with sensors is short already."""
+    """Split filter input into short pieces, each with the state before it; input with sensors is already in pieces."""
     size = len(replay.epochs)
     sensed = any(getattr(replay.sensors, f.name) is not None for f in fields(SensorEpochs) if f.name != "wheel_sign")
     if size <= _EPOCHS or sensed:

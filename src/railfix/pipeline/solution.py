@@ -26,7 +26,7 @@ class ProtectionResult(NotebookTable):
 
     #: Protection levels; NaN at epochs without a position, or with a fault that remains after RAIM.
     level: ProtectionLevel
-    status: Codes  #: `protection.LevelStatus` against `Config.alarm_limit_m`, shape (T,).
+    status: Codes  #: `protection.LevelStatus` for `Config.alarm_limit_m`, shape (T,).
     kind: str  #: Fault hypotheses of the levels: "sbas" or "separation" (`level_stage.KINDS`).
     basis: str  #: "measured" or "indicative": whether the priors were measured on the line (`level_stage.BASES`).
 
@@ -36,16 +36,16 @@ class Solution(NotebookTable):
     """Outputs of the positioning stages at T epochs."""
 
     point: SinglePoint  #: Conventional position, with one clock per constellation.
-    #: 3-D positions of consistent ranges after exclusions; NaN where the ranges are inconsistent; (T, 3).
+    #: 3-D positions from the ranges that remain after exclusions; NaN if these are inconsistent; shape (T, 3).
     consistent_ecef_m: Floats
     #: `railfix.integrity.PointStatus` of the conventional position, shape (T,).
     conventional_status: Codes
-    fix: LineFix  #: Positions from codes after exclusions.
-    ties: InterSystemBiases  #: Inter-system biases known before each epoch, by `Channels.clocks`.
+    fix: LineFix  #: Positions on the line from codes, after exclusions.
+    ties: InterSystemBiases  #: Inter-system biases known before each epoch, for `Channels.clocks`.
     raim: RaimResult  #: Result of RAIM; `outcome` is UNTESTABLE at all epochs if the screen is off.
     status: Codes  #: `reasons.Status`, shape (T,).
-    #: Ratio of the receiver's range standard deviation to the assumed value, shape (T,): root mean square of the
-    #: normalised residuals after RAIM over previous epochs, with exponential forgetting.
+    #: Ratio of the receiver's range standard deviation to the assumed value, shape (T,): root mean square, over earlier
+    #: epochs with exponential forgetting, of the normalised residuals that remain after RAIM.
     noise_scale: Floats
     #: Single-epoch sigma: standard deviation along the line from the codes of the epoch alone. It uses the larger of
     #: the receiver's noise and the noise estimated from the epoch's residuals, and is widened by Student's t where few
@@ -53,14 +53,14 @@ class Solution(NotebookTable):
     epoch_sigma_m: Floats
     #: Position along the antenna's trajectory, from codes or from code and phase; shape (T,).
     arc_m: Floats
-    #: Standard deviation along the line. It combines the range noise, estimated from the weights and from the residuals
-    #: of the window and the epoch; satellite and atmospheric errors; the map error; and the distance to an unresolved
+    #: Standard deviation along the line. It combines the range noise (from the weights and the residuals of this and
+    #: earlier epochs), the satellite and atmospheric errors, the map error, and the distance to an unresolved
     #: alternative position, weighted by the alternative's probability; shape (T,).
     along_sigma_m: Floats
     #: Positions from code and phase if ``Config.carrier`` is "float" or "fixed"; `arc_m` then has these positions.
     phase: PhasePositions | None
     protection: ProtectionResult | None  #: Protection levels along the line; None if off.
-    map_offset: MapOffset  #: Mean offset of the 3-D positions of the last minutes from the line.
+    map_offset: MapOffset  #: Mean offset from the line of the last minutes' 3-D positions.
     off_map: Masks  #: True where the train is away from the line (`railfix.pipeline.off_map`); shape (T,).
     araim: AraimResult | None = None  #: ARAIM levels; None without an integrity support message.
 

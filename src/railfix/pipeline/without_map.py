@@ -28,11 +28,11 @@ from railfix.ranges.corrected import CorrectedRanges, corrected_ranges, find_sat
 from railfix.track.survey.runs import RunSignals, SurveyLimits, SurveyRun, rows_apart
 
 _EARTH_RADIUS_M: Final = 6.371e6
-#: Range of ellipsoidal heights of receivers on land and in aircraft [m]; positions outside this range count as wrong.
+#: Positions outside this range of ellipsoidal heights count as wrong [m]; it covers receivers on land and in aircraft.
 _HEIGHTS_M: Final = (-500.0, 10_000.0)
 #: Height range of the tropospheric model [m].
 _MODELLED_HEIGHTS_M: Final = (-100.0, 10_000.0)
-#: The search for gross errors starts if the rms of the residuals, before atmospheric corrections, exceeds this [m].
+#: Gross errors are searched for only if the rms of the residuals, before atmospheric corrections, exceeds this [m].
 _QUIET_M: Final = 10.0
 
 
@@ -63,7 +63,7 @@ class NoPosition(IntEnum):
 _TEXTS: Final = {
     NoPosition.NONE: "position",
     NoPosition.NO_CODE: "no pseudorange observed",
-    NoPosition.NO_RECORD: "no valid and healthy navigation record of enough satellites",
+    NoPosition.NO_RECORD: "too few satellites with a valid and healthy navigation record",
     NoPosition.TOO_FEW_SATELLITES: "too few usable satellites",
     NoPosition.NO_CONVERGENCE: "satellite geometry without a solution",
     NoPosition.INCONSISTENT: "ranges contradict each other by over 100 m",
@@ -76,7 +76,7 @@ class Located:
     """3-D positions of one antenna, T epochs."""
 
     time: Datetimes  #: Time tags, shape (T,).
-    ecef_m: Floats  #: NaN without a position, shape (T, 3).
+    ecef_m: Floats  #: Antenna positions, NaN if unknown, shape (T, 3).
     #: Standard deviations north, east and up, shape (T, 3), from range sigmas that include atmospheric and orbit
     #: errors. They are scaled up if residuals are large.
     sigma_m: Floats
@@ -95,12 +95,12 @@ class RangesWithoutMap:
     no_position: Codes  #: `NoPosition` from the numbers of codes, records and satellites; shape (T,).
 
 
-#: Codes with one of these rejection reasons are not counted as observed.
+#: Codes with one of these rejection reasons count as not observed.
 _OF_CODES: Final = int(Reason.NOT_OBSERVED | Reason.IMPLAUSIBLE_CODE | Reason.OTHER_SIGNAL_TAKEN)
 
 
 def ranges_without_map(obs: Observations, received: Received, config: Config, book: ChannelBook) -> RangesWithoutMap:
-    """Return corrected ranges of one antenna without a track, and approximate positions from the codes.
+    """Return an antenna's corrected ranges, computed without a track, and approximate positions from the codes.
 
     The ranges are corrected by the delay models and by received base station errors, but not by SBAS.
     """
@@ -209,23 +209,23 @@ def locate_ranges(time: Datetimes, seen: RangesWithoutMap, config: Config) -> Lo
 
 
 def _below(ranges: Ranges) -> Floats:
-    """Return the point on the Earth's surface below the mean of the satellites, shape (T, 3) [m], to start the fit."""
+    """Return start positions of the fit, on the Earth's surface below the mean of the satellites, shape (T, 3) [m]."""
     weight = (ranges.weight > 0).astype(np.float64)
     mean = np.einsum("tk,tki->ti", weight, ranges.sat_ecef_m) + np.array([1.0, 0.0, 0.0])
     return np.asarray(mean / np.linalg.norm(mean, axis=1, keepdims=True) * _EARTH_RADIUS_M)
 
 
-#: Longest step for which range changes are computed, in survey intervals; over longer steps the mean of two Dopplers is
-#: too inaccurate.
+#: Range changes are computed between epochs at most this number of survey intervals apart; over longer times the mean
+#: of two Dopplers is too inaccurate.
 _LONGEST_STEP: Final = 2.5
-#: Acceleration that determines the standard deviation of a Doppler-derived range change [m/s^2].
+#: Acceleration assumed for the standard deviation of a range change computed from Dopplers [m/s^2].
 _CURVED_MPS2: Final = 0.05
 
 
 def survey_run(
     parts: Iterable[Observations], received: Received, config: Config, limits: SurveyLimits, *, name: str
 ) -> SurveyRun:
-    """Return the survey run of a log, read in parts, with its ranges and range changes.
+    """Return the survey run of a log that is read in parts, including ranges and range changes.
 
     No range change spans two parts. Raise ValueError if fewer than three epochs have a position.
     """
@@ -253,8 +253,8 @@ def _survey_part(
 ) -> tuple[SurveyRun, RunSignals, CycleSlipState | None]:
     """Return the survey run of observations decimated to the survey interval, the signals, and the slip state.
 
-    A range change is the carrier-phase change if the phase continues without a slip at every epoch between, otherwise
-    it is computed from the mean of the Dopplers at both ends.
+    A range change is the change of the carrier phase, if the phase has no slip or break between the two epochs.
+    Otherwise, it is computed from the mean of the Dopplers at both epochs.
     """
     seen = ranges_without_map(obs, received, config, book)
     located, channels = locate_ranges(obs.time, seen, config), seen.corrected.channels
