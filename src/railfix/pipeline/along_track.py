@@ -157,8 +157,8 @@ def apply_spacing_verdict(
 ) -> tuple[AlongTrack, FilterState]:
     """Mark positions as doubtful where the antennas' positions or speeds disagree; return positions and test state.
 
-    `spacing` has the verdicts of the antenna spacing screen, shape (T,), or is None. A rejection also applies to the
-    `held_s` seconds after its epoch.
+    `spacing` has the verdicts of the antenna spacing screen, shape (T,), or is None. After a rejection, positions stay
+    doubtful for `held_s` seconds.
     """
     time, error = result.tracked.time, result.spacing_error_m
     disagreed = np.full(len(time) + 1, state.disagreed)

@@ -99,8 +99,8 @@ else:
         "ScreenSettings", __base__=Settings, **{screen.name: (type(screen.limits), screen.limits) for screen in SCREENS}
     )
 
-#: The filter drops its position after this time off the map, and restarts after the same time on the map [s]. On the
-#: recordings, with a correct map, no two consecutive positions are off the map.
+#: The filter drops its position after this time off the map, and restarts after the same time on the map [s]. On
+#: recorded runs with a correct map, no two consecutive positions are off the map.
 OFF_MAP_S: Final = 10.0
 
 
@@ -163,7 +163,7 @@ class Config(ScreenSettings):
     interference: InterferenceLimits = InterferenceLimits()  #: Detection of jamming and spoofing.
     noise: CodeNoise = CodeNoise()  #: Model of the range sigmas, which determine the weights.
     #: Files of SBAS messages, or "stream" for messages that the receivers pass on; empty if SBAS is not used. SBAS
-    #: corrections replace the models, and satellites without a valid correction are rejected.
+    #: replaces the models of `ionosphere` and `troposphere`; satellites without a valid correction are rejected.
     sbas: tuple[Path, ...] | Literal["stream"] = ()
     #: SBAS messages to use: L1 messages correct GPS L1 C/A; L5 messages (dual-frequency) correct the ionosphere-free
     #: codes of GPS L1 C/A and L5, and of Galileo E1 and E5a. With L5, satellites without both codes are rejected.
@@ -195,9 +195,9 @@ class Config(ScreenSettings):
     #: Computation of the RAIM protection level of P4: the largest slope times the largest undetected bias.
     raim_protection: Literal["on", "off"] = "off"
     #: Use of the carrier phase. "smoothed" smooths the codes. "float" and "fixed" estimate positions from the codes and
-    #: phases up to the epoch, with float or integer ambiguities ("fixed" requires a base station). On recordings,
-    #: smoothing helps most on a phone, and float ambiguities help most under open sky. In towns, where arcs last
-    #: seconds, neither removes large errors.
+    #: phases up to the epoch, with float or integer ambiguities ("fixed" requires a base station). On recorded runs,
+    #: smoothing helps phones most, and float ambiguities help most under open sky. In towns, where phase arcs last
+    #: seconds, neither setting removes large errors.
     carrier: Literal["off", "smoothed", "float", "fixed"] = "off"
     #: Standard deviation of a carrier phase at the zenith, multipath included.
     phase_sigma_m: float = Field(default=0.01, gt=0)

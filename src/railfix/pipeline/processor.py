@@ -245,7 +245,7 @@ class EpochProcessor:
         ValueError
             The epochs of an antenna are not in ascending order, or do not begin after the last epoch of `state`.
         SettingsError
-            A condition listed for the class applies, an antenna has no trajectory, or there are no navigation records.
+            A SettingsError of the class applies, an antenna has no trajectory, or there are no navigation records.
         """
         if navigation is None and state is None and not self._navigation_given:
             raise SettingsError("no navigation records: EpochProcessor(..., navigation=read_navigation(file))")

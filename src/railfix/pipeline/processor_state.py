@@ -36,7 +36,7 @@ class AntennaState(NotebookTable):
     carrier: CarrierState | None = None  #: State of the carrier-phase stages; None if unused.
     #: Time tag of the last epoch; NaT before the first epoch.
     ended: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
-    #: Mean differences of the satellites' two codes.
+    #: Mean differences between the two codes of each satellite.
     two_frequencies: TwoFrequencyState = field(default_factory=TwoFrequencyState)
 
     interference: InterferenceState = field(default_factory=InterferenceState)

@@ -293,7 +293,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
             "`dilution` (over its limit)",
             words=tuple(s.name.lower() for s in PointStatus),
         ),
-        Column("conventional_chainage_m", "3-D single point, moved to the nearest point of the trajectory"),
+        Column("conventional_chainage_m", "chainage of the trajectory point nearest to the 3-D single point"),
         Column("conventional_offset_m", "distance of the 3-D single point from the nearest point of the trajectory"),
         Column(
             "map_offset_across_m",
@@ -302,13 +302,13 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column("map_offset_up_m", "mean height above the line of the last minutes' 3-D positions", "map_offset.up_m"),
         *of_one_meaning(
-            "smallest offset, across and up, that the test for the status `map_offset` detects with 99 % probability",
+            "smallest offset across (or up) that the test for the status `map_offset` detects with 99 % probability",
             map_detectable_across_m=lambda r: r.map_offset.detectable_m[:, 0],
             map_detectable_up_m=lambda r: r.map_offset.detectable_m[:, 1],
         ),
         Column(
             "map_offset_statistic",
-            "squared normalised offset; the status is `map_offset` from 13.8 on",
+            "squared normalised map offset; the status is `map_offset` from 13.8 on",
             "map_offset.statistic",
         ),
         Column(
@@ -346,7 +346,7 @@ CHANNEL_COLUMNS: Final[Mapping[str, Column[Observed]]] = by_name(
         Column("reason", "bits of `railfix.core.reasons.Reason`, 0 = used", "result.reason", dtype=pl.Int32()),
         Column(
             "residual_m",
-            "corrected pseudorange minus the range and clock at the position on the line",
+            "corrected pseudorange minus geometric range and receiver clock at the position on the line",
             "result.residual_m",
         ),
         Column("elevation_deg", "elevation of the satellite", "result.elevation_deg"),

@@ -218,7 +218,7 @@ TRAIN_COLUMNS: Final[Mapping[str, Column[AlongTrack]]] = by_name(
             "distance since codes were last used (`L_DOUBTOVER` minus `Q_LOCACC`)",
             "tracked.amount_m",
         ),
-        Column("under_reading_m", "largest distance of the train ahead of the position", "tracked.amount_m"),
+        Column("under_reading_m", "largest distance from position to train ahead (`L_DOUBTUNDER`)", "tracked.amount_m"),
         Column(
             "motion",
             "state of motion from tachometer and inertial unit together, see `docs/sensors.md`",

@@ -78,8 +78,8 @@ class SensorLimits(Settings):
     return_sigmas: float = Field(default=4.0, gt=0)
     #: After an outage, codes are used again after this time in any case.
     return_s: float = Field(default=60.0, ge=0)
-    #: Standard deviation of a distance between two epochs due to creep of a braked or driven wheel, in addition to the
-    #: pulse quantisation.
+    #: Standard deviation of the wheel distance between two epochs, due to creep of a braked or driven wheel; the pulse
+    #: quantisation is added.
     wheel_sigma_m: float = Field(default=0.01, gt=0)
     #: Usual interval of radar speed samples.
     radar_step_s: float = Field(default=0.1, gt=0)

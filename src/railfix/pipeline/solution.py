@@ -35,20 +35,20 @@ class ProtectionResult(NotebookTable):
 class Solution(NotebookTable):
     """Outputs of the positioning stages at T epochs."""
 
-    point: SinglePoint  #: Conventional position, with one clock per constellation.
+    point: SinglePoint  #: Conventional 3-D position, with one clock per constellation.
     #: 3-D positions from the ranges that remain after exclusions; NaN if these are inconsistent; shape (T, 3).
     consistent_ecef_m: Floats
     #: `railfix.integrity.PointStatus` of the conventional position, shape (T,).
     conventional_status: Codes
     fix: LineFix  #: Positions on the line from codes, after exclusions.
     ties: InterSystemBiases  #: Inter-system biases known before each epoch, for `Channels.clocks`.
-    raim: RaimResult  #: Result of RAIM; `outcome` is UNTESTABLE at all epochs if the screen is off.
+    raim: RaimResult  #: Result of RAIM; `outcome` is UNTESTABLE at all epochs if RAIM is off.
     status: Codes  #: `reasons.Status`, shape (T,).
     #: Ratio of the receiver's range standard deviation to the assumed value, shape (T,): root mean square, over earlier
     #: epochs with exponential forgetting, of the normalised residuals that remain after RAIM.
     noise_scale: Floats
     #: Single-epoch sigma: standard deviation along the line from the codes of the epoch alone. It uses the larger of
-    #: the receiver's noise and the noise estimated from the epoch's residuals, and is widened by Student's t where few
+    #: the receiver's noise and the noise estimated from the epoch's residuals, and is larger, by Student's t, if few
     #: ranges are redundant. Epochs with a dropped position have a value as well; shape (T,).
     epoch_sigma_m: Floats
     #: Position along the antenna's trajectory, from codes or from code and phase; shape (T,).

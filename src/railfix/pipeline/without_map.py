@@ -30,7 +30,7 @@ from railfix.track.survey.runs import RunSignals, SurveyLimits, SurveyRun, rows_
 _EARTH_RADIUS_M: Final = 6.371e6
 #: Positions outside this range of ellipsoidal heights count as wrong [m]; it covers receivers on land and in aircraft.
 _HEIGHTS_M: Final = (-500.0, 10_000.0)
-#: Height range of the tropospheric model [m].
+#: Heights are clipped to this range for the tropospheric model [m].
 _MODELLED_HEIGHTS_M: Final = (-100.0, 10_000.0)
 #: Gross errors are searched for only if the rms of the residuals, before atmospheric corrections, exceeds this [m].
 _QUIET_M: Final = 10.0
