@@ -31,9 +31,9 @@ from railfix.track import Track, interpolate_kilometrage
 
 _SEMI_MAJOR_M: Final = 6_378_137.0
 _FLATTENING: Final = 1.0 / 298.257_223_563
-#: Spacing of the points at which the curve is integrated [m]; the spline between the points is exact to 1e-6 m.
+#: Spacing of the points at which the line is integrated [m]; the spline between the points is accurate to 1e-6 m.
 _STEP_M: Final = 0.5
-#: Number of rounds of the integration; each round multiplies the error by (line length / Earth radius).
+#: Number of rounds of the integration; each round reduces the error by a factor of (line length / Earth radius).
 _ROUNDS: Final = 8
 
 #: Elements of the simulated test line: length [m]; radius at the end of the element (right positive) [m]; cant at the
@@ -49,7 +49,7 @@ PATTERN: Final = (
     (35.0, np.inf, 0.0),
     (226.0, np.inf, 0.0),
 )
-#: Gradient at points of the pattern: chainage [m] and gradient [permille]. Between the points, the gradient is linear.
+#: Gradients of the simulated test line: chainage [m] and gradient [permille]; linear between these chainages.
 GRADIENT: Final = (
     (0.0, 0.0), (60.0, 0.0), (100.0, -4.0), (180.0, -4.0), (240.0, 10.0), (380.0, 10.0), (450.0, 2.5),
     (560.0, 2.5), (620.0, -6.0), (700.0, -6.0), (756.0, 0.0),
@@ -225,7 +225,7 @@ def _integrate(line: Alignment) -> tuple[Floats, Floats]:
     lat0, lon0 = np.radians([settings.latitude_deg, settings.longitude_deg])
 
     def total(rate: Floats) -> tuple[Floats, Floats]:
-        """Return the integrals, at interval edges and at Gauss points, of a rate with values at the Gauss points."""
+        """Integrate a rate, given at the Gauss points, up to the interval edges and up to the Gauss points."""
         at_edges = np.concatenate([[0.0], np.cumsum(rate.mean(axis=1) * step)])
         slope = (rate[:, 1] - rate[:, 0]) / (offset[1] - offset[0])
         start = rate[:, 0] - slope * offset[0]

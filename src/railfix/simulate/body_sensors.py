@@ -1,7 +1,7 @@
 """Pulse times of a tachometer; specific force and angular rate of an inertial sensor fixed to the body.
 
-The inertial quantities are computed from differences in time of the body's position and attitude in the Earth-fixed
-frame; gravity and Earth rotation are included (Groves 2013, 2.3 to 2.5 and 5.2).
+The inertial quantities are computed by differencing the body's Earth-fixed position and attitude over time; gravity and
+Earth rotation are included (Groves 2013, 2.3 to 2.5 and 5.2).
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ if TYPE_CHECKING:
 #: Time step [s]; within a step, the wheel's acceleration is assumed to be constant.
 _STEP_S: Final = 0.01
 _LOOK_S: Final = 0.1  #: Time step of the search for phases of acceleration and braking [s].
-_HARD_MPS2: Final = 0.05  #: Minimum acceleration or deceleration in a phase of acceleration or braking [m/s^2].
-#: Streams of random numbers: phase and jitter, slips, teeth, lost and doubled pulses.
+_HARD_MPS2: Final = 0.05  #: Phases with less acceleration are ignored [m/s^2].
+#: Seeds of random streams: phase and jitter, slips, tooth errors, lost and doubled pulses.
 _WHEEL, _SLIPS, _TEETH, _MISCOUNT = 20, 21, 30, 31
 
 
 def wheel_slips(simulation: Simulation, settings: TachometerSettings) -> list[SlipInterval]:
-    """Return the slips and slides of the run in order of time: those of the settings, and those drawn at random.
+    """Return the slips and slides of the run in order of time, both specified in the settings and drawn at random.
 
     A drawn slip or slide that overlaps another is left out.
     """
@@ -57,8 +57,7 @@ def _draw(motion: Motion, duration_s: float, drawn: DrawnSlips, rng: np.random.G
     for first, last in pairwise(change.tolist()):
         if kind[first] == 0.0:
             continue
-        # The numbers are drawn for every phase, so that the slips of a phase do not depend on the slips of other
-        # phases.
+        # Random numbers are drawn for every phase, so that the slips of a phase do not depend on slips in other phases.
         chance, size, lasting, place = rng.uniform(size=4)
         if chance >= (drawn.slip_chance if kind[first] > 0.0 else drawn.slide_chance):
             continue
@@ -116,7 +115,7 @@ def _times_at(target_m: Floats, node_s: Floats, turned_m: Floats, speed_mps: Flo
     """Return the times at which the wheel has rolled the given distances, with constant acceleration between nodes."""
     step = np.diff(node_s)
     cell = np.clip(np.searchsorted(turned_m, target_m, side="left") - 1, 0, len(step) - 1)
-    # s = v t + a t^2 / 2, with the constant acceleration at which the wheel rolls the distance between the nodes.
+    # s = v t + a t^2 / 2; a is constant between two nodes and chosen so that the wheel rolls the distance between them.
     start = speed_mps[cell]
     bend = 2.0 * (turned_m[cell + 1] - turned_m[cell] - start * step[cell]) / step[cell] ** 2
     ahead = target_m - turned_m[cell]
@@ -177,16 +176,16 @@ def slip_table(simulation: Simulation, settings: TachometerSettings) -> pl.DataF
     return pl.DataFrame({"time_gpst": start, "end_gpst": end, "ratio": ratio})
 
 
-_HALF_S: Final = 0.02  #: Largest half-width of the interval over which differences are formed [s].
+_HALF_S: Final = 0.02  #: Largest half-width of the interval over which positions and attitudes are differenced [s].
 _BLOCK: Final = 50_000  #: Number of samples computed in one step.
-#: Length of the lever arm from which the attitude is computed; with this length, rounding of positions is negligible
-#: [m].
+#: Length [m] of the lever arm from which the attitude is computed, long enough for rounding of positions to be
+#: negligible.
 _LEVER_M: Final = 10.0
 #: Constants of WGS 84: normal gravity at the equator [m/s^2], Somigliana's constant, flattening, ratio m of centrifugal
 #: acceleration to gravity, semi-major axis [m].
 _GRAVITY: Final = (9.780_325_335_9, 1.931_852_652_41e-3, 1.0 / 298.257_223_563, 3.449_786_506_84e-3, 6_378_137.0)
 _ECCENTRICITY_2: Final = 6.694_379_990_14e-3
-#: Streams of random numbers: noise, bias drifts, bias walk, vibration.
+#: Seeds of random streams: noise, drifts of accelerometer and gyroscope biases, walk of gyroscope biases, vibration.
 _NOISE, _ACCEL_DRIFT, _GYRO_DRIFT, _WALK, _VIBRATION = 22, 23, 24, 25, 29
 
 
@@ -218,7 +217,7 @@ def true_motion(simulation: Simulation, offset_m: tuple[float, float, float], ti
     """
     before, now, after = (_pose(simulation, offset_m, time_s + d) for d in (-half_s, 0.0, half_s))
     place, axes = now
-    # Positions are subtracted before the sum is formed, which avoids a loss of digits.
+    # The two differences of positions are formed before they are subtracted, which avoids cancellation.
     acceleration = ((after[0] - place) - (place - before[0])) / half_s**2
     velocity = (after[0] - before[0]) / (2.0 * half_s)
     latitude, longitude, height = geodetic_from_ecef(place)

@@ -26,8 +26,8 @@ from railfix.io.rinex import read_navigation
 from railfix.io.rinex.navigation_records import glonass_records
 from railfix.simulate.scenario import Scenario
 
-#: Health word of an unhealthy satellite, by constellation: all data bad (GPS, QZSS), E1-B and E5b out of service
-#: (Galileo), SatH1 (BeiDou).
+#: Health word that marks a satellite as unhealthy, by constellation: all data bad (GPS, QZSS), E1-B and E5b out of
+#: service (Galileo), SatH1 (BeiDou).
 _ILL_HEALTH: Final = {"G": 63, "J": 63, "E": 0b001_000_010 | 0b010_000_000, "C": 1}
 #: A record is valid up to this time before and after its reference time [s], as in `railfix.gnss.orbits`.
 _SERVES_S: Final = {"G": 7200.0, "J": 7200.0, "E": 14_400.0, "C": 21_600.0}
@@ -86,9 +86,9 @@ def _select_simulated(records: KeplerRecords, systems: str, messages: dict[str, 
 
 
 def _serving(records: KeplerRecords, satellite: str, first: np.datetime64, last: np.datetime64) -> Indices:
-    """Return the indices of a satellite's records in force from `first` to `last`, in order of transmission.
+    """Return the indices of the records of a satellite that are successively in force between `first` and `last`.
 
-    The result is empty if the record in force is not valid at some time, or there is no record in force.
+    The result is empty if, at any time, no record is in force or the record in force is not valid.
     """
     rows = np.flatnonzero(records.satellite == satellite)
     rows = rows[np.lexsort((records.toe[rows], records.transmitted[rows]))]
@@ -106,12 +106,12 @@ def _serving(records: KeplerRecords, satellite: str, first: np.datetime64, last:
     return np.asarray(rows[: len(rows) if served.all() else 0])
 
 
-#: Fictitious Klobuchar coefficients of realistic size, alpha then beta, for all constellations.
+#: Fictitious Klobuchar coefficients of realistic size, alpha then beta, for the signals of all constellations.
 KLOBUCHAR: Final = (1.118e-8, 2.235e-8, -5.960e-8, -1.192e-7, 1.044e5, 1.147e5, -6.554e4, -3.277e5)
-#: Time between the transmissions of two successive records [s] (IS-GPS-200: two hours).
+#: Interval at which a satellite transmits a new record [s], by constellation (IS-GPS-200: two hours).
 _ISSUE_S: Final = {"G": 7200, "J": 3600, "E": 3600, "C": 3600}
-_SENT_AFTER_S: Final = 18  #: Delay of the first transmission of a record after the full hour [s].
-_SYNCHRONOUS_M: Final = (GM_GPS / EARTH_ROTATION_RATE**2) ** (1.0 / 3.0)  #: Radius of a synchronous orbit [m].
+_SENT_AFTER_S: Final = 18  #: Time from the full hour to the first transmission of a record [s].
+_SYNCHRONOUS_M: Final = (GM_GPS / EARTH_ROTATION_RATE**2) ** (1.0 / 3.0)  #: Radius of a geosynchronous orbit [m].
 #: Galileo data source: I/NAV of E1-B and of E5b-I, clock of E5b and E1 (RINEX 3.04, table A8: bits 0, 2 and 9).
 _INAV_SOURCE: Final = 517
 
@@ -133,8 +133,8 @@ def simulate_navigation(scenario: Scenario) -> Navigation:
     """Return the broadcast records for the duration of a run.
 
     All values are rounded to the digits that `railfix.io.write_navigation` writes, so that file and arrays describe the
-    same satellites. If the scenario names a navigation file, `navigation_of_file` reads the records and may raise its
-    errors.
+    same satellites. If the scenario names a navigation file, the records are read by `navigation_of_file`, which may
+    raise exceptions.
     """
     if scenario.sky.nav is not None:
         return navigation_of_file(scenario, scenario.sky.nav)
@@ -278,8 +278,8 @@ def _digits(value: float) -> str:
     return f"{value:.12E}"
 
 
-_PIECE_S: Final = 60.0  #: Longest piece of `SatelliteTable` [s].
-_NODES: Final = 7  #: Number of nodes per piece of `SatelliteTable`.
+_PIECE_S: Final = 60.0  #: Duration of a piece of `SatelliteTable`, in which positions and clocks are interpolated [s].
+_NODES: Final = 7  #: Number of interpolation nodes per piece of `SatelliteTable`.
 #: Approximate flight time of a signal, with which the iteration of the light-time equation begins [s].
 _FLIGHT_S: Final = 0.08
 
@@ -288,7 +288,7 @@ _FLIGHT_S: Final = 0.08
 class Links:
     """Geometry and satellite clocks of signals received at T instants from one satellite or from S satellites."""
 
-    #: Geometric range in the Earth-fixed frame at reception, with Earth rotation; shape (T,) or (T, S).
+    #: Geometric range, including the effect of Earth rotation; shape (T,) or (T, S).
     range_m: Floats
     #: Satellite position at transmission, in the Earth-fixed frame at reception; shape (T, 3) or (T, S, 3).
     satellite_ecef_m: Floats
@@ -317,7 +317,7 @@ def newest_record(records: KeplerRecords, satellite: str, time: Datetimes) -> In
 
 
 def links(records: KeplerRecords, satellite: str, tag: Datetimes, late_s: Floats, receiver_ecef_m: Floats) -> Links:
-    """Return the geometry of the signals received from a satellite at instants that precede T time tags by `late_s`.
+    """Return the geometry of the signals received from a satellite `late_s` before each of T time tags.
 
     The light-time equation is solved by iteration.
     """

@@ -11,7 +11,7 @@ from railfix.pipeline import Config, EpochProcessor, Result
 from railfix.run import RunInputs
 from railfix.track import antenna_trajectory, read_track, read_vehicle
 
-#: Files of the demonstration run by kind, with the names that `railfix.simulate.write_run` uses.
+#: Names of the files of the demonstration run by kind, as `railfix.simulate.write_run` names them.
 DEMO_FILES: Final = {
     "front": "front.crx.gz",
     "rear": "rear.crx.gz",

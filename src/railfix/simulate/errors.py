@@ -27,11 +27,11 @@ from railfix.ranges.sbas.troposphere import rtca_mapping
 from railfix.simulate.constellation import newest_record, record_state
 from railfix.simulate.settings import ErrorSettings, SatelliteErrorSettings, SatelliteFault
 
-_NODES_A_TIME: Final = 32  #: Number of nodes per correlation time.
-#: Minimum number of nodes before the start of the run.
+_NODES_A_TIME: Final = 32  #: Number of interpolation nodes per correlation time.
+#: Minimum number of interpolation nodes before the start of the run.
 _BEFORE: Final = 3
-#: Margins before and after the run [s]. They are needed because clock biases shift instants beyond the start and the
-#: end of the run.
+#: Errors are also drawn for these times before and after the run [s], because clock biases shift instants beyond the
+#: start and the end of the run.
 _ROOM_S: Final = (0.1, 1.0)
 
 
@@ -43,7 +43,7 @@ def satellite_key(satellite: str) -> tuple[int, int]:
 
 
 class Interpolated:
-    """C functions of time with values at K evenly spaced nodes, shape (K, C); the interpolation has a continuous rate.
+    """Functions of time, given at K evenly spaced nodes, shape (K, C); the interpolation has a continuous derivative.
 
     `nodes_before` nodes precede the start of the run.
     """
@@ -65,7 +65,7 @@ class Interpolated:
         return a, b, c, d, (place - cell)[:, None]
 
     def at(self, time_s: Floats) -> Floats:
-        """Return the values, shape (T, C), at times after the start, shape (T,) [s].
+        """Return the values, shape (T, C), at times counted from the start of the run, shape (T,) [s].
 
         Raise ValueError if a time is outside the run and its margins.
         """
@@ -73,7 +73,7 @@ class Interpolated:
         return np.asarray(b + u / 2.0 * ((c - a) + u * (2.0 * a - 5.0 * b + 4.0 * c - d + u * (3.0 * (b - c) + d - a))))
 
     def rate(self, time_s: Floats) -> Floats:
-        """Return the rates of change per second, shape (T, C), at times after the start, shape (T,) [s]."""
+        """Return the rates of change per second, shape (T, C), at times from the start of the run, shape (T,) [s]."""
         a, b, c, d, u = self._place(time_s)
         slope = (c - a) + u * (2.0 * (2.0 * a - 5.0 * b + 4.0 * c - d) + 3.0 * u * (3.0 * (b - c) + d - a))
         return np.asarray(slope / 2.0 / self._spacing_s)
@@ -145,7 +145,7 @@ _COSINES: Final = 64  #: Number of cosines whose sum is a `RandomFunction`.
 class RandomFunction:
     """Realisation of a stationary, nearly Gaussian random function, a sum of W cosines."""
 
-    amplitude: float  #: Amplitude of each cosine.
+    amplitude: float  #: Amplitude of the cosines.
     frequency: Floats  #: Angular frequencies [rad per unit of the variable], shape (W,).
     phase: Floats  #: Phases [rad], shape (W,).
 
@@ -156,7 +156,7 @@ class RandomFunction:
 
     @classmethod
     def periodic(cls, rng: np.random.Generator, *, sigma: float, period: float) -> Self:
-        """Return an oscillation of standard deviation `sigma` around a period, with a relative bandwidth of 15 %."""
+        """Return an oscillation with standard deviation `sigma`, mean period `period` and relative bandwidth 15 %."""
         return cls._draw(rng, sigma, 2.0 * np.pi / period * (1.0 + 0.15 * rng.normal(0.0, 1.0, _COSINES)))
 
     @classmethod
@@ -175,10 +175,10 @@ class RandomFunction:
         return self.amplitude * total
 
 
-#: Spacing of the nodes between which the axes of an orbit are interpolated [s]; in this time, the axes turn by half a
-#: degree.
+#: Spacing of the nodes between which the radial, along-track and cross-track axes of an orbit are interpolated [s]; in
+#: this time, the axes turn by half a degree.
 _AXES_S: Final = 60.0
-#: Streams of random numbers: satellite clocks, orbit errors (three axes from this number on), group delays, ionosphere,
+#: Seeds of random streams: satellite clocks, orbit errors (11 to 13, one for each axis), group delays, ionosphere,
 #: troposphere.
 _CLOCK, _AXIS, _DELAY, _IONOSPHERE, _TROPOSPHERE = 10, 11, 14, 15, 16
 
@@ -299,7 +299,7 @@ class CommonErrors:
     def ionosphere_m(
         self, time_s: Floats, latitude_deg: Floats, longitude_deg: Floats, elevation_deg: Floats, azimuth_deg: Floats
     ) -> Floats:
-        """Return the ionospheric delay on L1 in addition to the model, shape (T, S) [m].
+        """Return the part of the ionospheric L1 delay that the broadcast model lacks, shape (T, S) [m].
 
         The receiver's latitudes and longitudes have shape (T, 1) [deg].
         """
@@ -327,7 +327,7 @@ class CommonErrors:
 
 
 def fault_m(faults: Sequence[SatelliteFault], time_s: Floats, satellites: Sequence[str]) -> tuple[Floats, Floats]:
-    """Return the range errors of faults [m] and their rates [m/s], shapes (T, M), at times after the start [s]."""
+    """Return the range errors due to faults [m] and their rates [m/s], shapes (T, M), at times from the start [s]."""
     names = np.asarray(satellites)
     added, rate = np.zeros((2, len(time_s), len(names)))
     for fault in faults:

@@ -35,7 +35,7 @@ from railfix.track import Track, read_track
 
 PATTERN_LENGTH_M: Final = 756.0  #: Default length of the pattern of P1's test line [m].
 GENERATED_LENGTH_M: Final = 36_000.0  #: Default length of a generated line [m].
-LONGEST_LINE_M: Final = 1e7  #: Largest length of a line and of an element [m].
+LONGEST_LINE_M: Final = 1e7  #: A line or an element must not be longer than this [m].
 
 
 class Element(ScenarioSettings):
@@ -65,8 +65,8 @@ class Element(ScenarioSettings):
 class Gradient(ScenarioSettings):
     """Gradient of the line from a chainage to the next change of gradient."""
 
-    from_m: NotNegative  #: Chainage of the change of gradient, in the middle of the vertical curve.
-    permille: float = Field(ge=-100.0, le=100.0)  #: Positive where the line rises with chainage.
+    from_m: NotNegative  #: Chainage at which the gradient begins: the middle of the vertical curve.
+    permille: float = Field(ge=-100.0, le=100.0)  #: Gradient, positive where the line rises with chainage.
     vertical_radius_m: Positive = 4000.0  #: Radius of the vertical curve from the previous gradient to this gradient.
 
 
@@ -77,22 +77,22 @@ class Terrain(ScenarioSettings):
     straight_m: Annotated[Between, at_least(1.0)] = (200.0, 1500.0)  #: Range of the lengths of straights.
     #: Range of the lengths of curves, excluding their transitions.
     curve_m: Annotated[Between, at_least(1.0)] = (100.0, 500.0)
-    radius_m: Annotated[Between, at_least(100.0)] = (400.0, 1600.0)  #: Range of the radii.
-    permille: float = Field(default=10.0, ge=0.0, le=35.0)  #: Largest gradient.
+    radius_m: Annotated[Between, at_least(100.0)] = (400.0, 1600.0)  #: Range of the radii of curves.
+    permille: float = Field(default=10.0, ge=0.0, le=35.0)  #: Gradients are drawn up to this, rising or falling.
     #: Range of the distance between two changes of gradient.
     gradient_m: Annotated[Between, at_least(200.0)] = (400.0, 1500.0)
 
 
 class GeneratedLine(ScenarioSettings):
-    """Commercial line generated at random."""
+    """Randomly generated line with the geometry of a line in service."""
 
     seed: Seed = 1  #: Seed of the line, separate from the seed of the run, so that several runs can share a line.
-    #: Speed at which curves have the equilibrium cant. The cant is limited to `largest_cant_m` and rounded to 5 mm.
+    #: Speed for which curves have equilibrium cant. The cant is limited to `largest_cant_m` and rounded to 5 mm.
     speed_mps: Positive = 110.0 / 3.6
 
     largest_cant_m: NotNegative = 0.105
     vertical_radius_m: Positive = 4000.0  #: Radius of the vertical curves.
-    terrain: tuple[Terrain, ...] = (Terrain(),)  #: Terrains in order of `from_m`, the first from 0.
+    terrain: tuple[Terrain, ...] = (Terrain(),)  #: Terrains in order of `from_m`; the first begins at 0.
 
     @field_validator("terrain")
     @classmethod
@@ -106,11 +106,11 @@ class GeneratedLine(ScenarioSettings):
 class LineFile(ScenarioSettings):
     """Track file used as the line."""
 
-    path: str  #: Path for `railfix.track.read_track`; in a scenario file, relative to the file's folder.
-    from_m: NotNegative = 0.0  #: Chainage of the file at which the line begins.
-    to_m: float = Field(default=math.inf, allow_inf_nan=True)  #: Chainage of the file at which the line ends.
-    crs: str = ""  #: CRS of the file, an option of `read_track`; empty if the file states the CRS.
-    height_datum: str = ""  #: Height datum of the file, an option of `read_track`; empty if the file states the datum.
+    path: str  #: Path of the track file; in a scenario file, relative to the folder of the scenario file.
+    from_m: NotNegative = 0.0  #: Chainage in the track file at which the line begins.
+    to_m: float = Field(default=math.inf, allow_inf_nan=True)  #: Chainage in the track file at which the line ends.
+    crs: str = ""  #: CRS of the track file, an option of `read_track`; empty if the file states the CRS.
+    height_datum: str = ""  #: Height datum of the track file, an option of `read_track`; empty if the file states it.
     geoid: str = ""  #: Geoid of orthometric heights, an option of `read_track`; empty if no geoid is needed.
 
     _forward = field_validator("to_m")(beyond_start)
@@ -179,22 +179,22 @@ class LineSettings(ScenarioSettings):
         return self
 
 
-#: Distance between the contact points of a wheelset on generated lines [m], for the equilibrium cant.
+#: Distance between the contact points of a wheelset [m], used for the equilibrium cant of generated lines.
 _CONTACT_M: Final = 1.137
-#: If the direction has changed by more than this angle, the next curve of a generated line turns back [rad].
+#: If a generated line has turned by more than this angle [rad], its next curve turns back.
 _FAR_RAD: Final = np.radians(50.0)
-#: Height difference above which the next gradient of a generated line leads back toward the initial height [m].
+#: If a generated line is higher or lower than its start by more than this [m], its next gradient leads back.
 _HIGH_M: Final = 150.0
-_CANT_STEP_M: Final = 0.005  #: Step to which cant is rounded [m].
+_CANT_STEP_M: Final = 0.005  #: Cant is rounded to multiples of this [m].
 
 
 @dataclass(frozen=True, kw_only=True)
 class Knots:
     """Curvature and cant at K knots, and gradient at G knots, linear between the knots."""
 
-    knot_m: Floats  #: Chainage of the ends of the elements, from 0, shape (K,).
+    knot_m: Floats  #: Chainages at which the elements begin and end, shape (K,).
     curvature: Floats  #: Curvature in plan, positive to the right, shape (K,) [1/m].
-    lean_m: Floats  #: Cant, positive where the vehicle leans to the right, shape (K,).
+    lean_m: Floats  #: Cant, positive if the vehicle leans to the right, shape (K,).
     grade_knot_m: Floats  #: Chainage of the knots of the gradient, shape (G,).
     grade: Floats  #: Gradient, climb over plan length, shape (G,) [m/m].
 
@@ -266,8 +266,8 @@ def _plan(settings: LineSettings, rng: np.random.Generator) -> list[Element]:
         straight, curve = (float(np.round(rng.uniform(*r))) for r in (here.straight_m, here.curve_m))
         to_right = rng.random() < 0.5 if abs(heading) < _FAR_RAD else heading < 0.0
         side = 1.0 if to_right else -1.0
-        # Equilibrium cant. The transition has a length of at least 20 m, 400 times the cant, and 8 times the product of
-        # cant and speed in km/h.
+        # Equilibrium cant. The length of the transition is the largest of 20 m, 400 times the cant, and 8 times the
+        # cant times the speed in km/h.
         cant = min(limits.speed_mps**2 / (GRAVITY_MPS2 * radius) * _CONTACT_M, limits.largest_cant_m)
         cant = float(np.round(np.round(cant / _CANT_STEP_M) * _CANT_STEP_M, 3))
         speed_kmh = 3.6 * min(limits.speed_mps, np.sqrt(GRAVITY_MPS2 * radius * (cant + 0.06) / _CONTACT_M))
@@ -285,7 +285,7 @@ def _plan(settings: LineSettings, rng: np.random.Generator) -> list[Element]:
 
 
 def _cut(elements: list[Element], length_m: float) -> list[Element]:
-    """Return the elements up to a length; a straight replaces a last curve that does not fit, and its transitions."""
+    """Return the elements up to a length; a straight replaces the last curve and its transitions if they do not fit."""
     while elements and sum(item.length_m for item in elements) > length_m:
         # Straight, transition, curve, transition: all four are replaced.
         del elements[-4:]
@@ -314,15 +314,15 @@ def _profile(settings: LineSettings, rng: np.random.Generator) -> list[Gradient]
 
 
 _STEP_M: Final = 0.5  #: Spacing of the points at which the spline is converted to a function of arc length [m].
-_TIGHTEST_M: Final = 30.0  #: Smallest plausible radius of a curve [m].
+_TIGHTEST_M: Final = 30.0  #: A line from a file must not have curves with a smaller radius [m].
 
 
 @dataclass(frozen=True, kw_only=True)
 class FileLine:
     """Line through the V points of a track file."""
 
-    track: Track  #: Points of the file that are used.
-    point_m: Floats  #: Chainage of the points on the curve, shape (V,).
+    track: Track  #: Points of the file that belong to the line.
+    point_m: Floats  #: Chainage of these points along the curve, shape (V,).
     curve: CubicHermiteSpline[np.float64]  #: ECEF position [m] of the line as a function of chainage [m].
     knots: Knots
 

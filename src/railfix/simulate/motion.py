@@ -37,7 +37,7 @@ class Motion:
     Speed, acceleration and jerk are positive toward rising chainage. The last piece has no end.
     """
 
-    time_s: Floats  #: Start of each piece, rising from 0, shape (P,).
+    time_s: Floats  #: Start of each piece, from 0, in ascending order, shape (P,).
     chainage_m: Floats  #: Chainage at the start of each piece, shape (P,).
     speed_mps: Floats  #: Speed at the start of each piece, shape (P,).
     acceleration_mps2: Floats  #: Acceleration at the start of each piece, shape (P,).
@@ -67,7 +67,7 @@ class Motion:
 
 
 def limit_jerk(motion: Motion, jerk_mps3: float) -> Motion:
-    """Return a motion whose jerk is limited by averaging over a time T.
+    """Return the motion averaged over a time T, which is chosen so that the jerk is within its limit.
 
     The speed becomes ``(s(t) - s(t - T)) / T`` with the chainage s, so that the motion is delayed by T / 2 on average.
     """
@@ -107,8 +107,8 @@ def _acceleration_change(motion: Motion, time_s: Floats, duration_s: float) -> F
     return np.asarray(motion.acceleration_at(after) - motion.acceleration_at(after - duration_s))
 
 
-_STEP_M: Final = 2.0  #: Spacing of the positions at which a run curve evaluates the speed limits [m].
-_RAIL_HEAD_M: Final = 0.070  #: Distance between the contact points of a wheelset minus the gauge [m].
+_STEP_M: Final = 2.0  #: Spacing of the positions at which the speed limits of a run curve are evaluated [m].
+_RAIL_HEAD_M: Final = 0.070  #: Distance between a wheelset's contact points, minus the gauge [m].
 
 
 def build_motion(line: Alignment, scenario: Scenario, *, duration_s: float | None = None) -> Motion:
@@ -131,12 +131,12 @@ def build_motion(line: Alignment, scenario: Scenario, *, duration_s: float | Non
 
 
 def shuttle(first_m: float, last_m: float, duration_s: float, settings: RunSettings) -> Motion:
-    """Return the motion back and forth between two chainages for at least `duration_s`, with standstill at both."""
+    """Return the motion back and forth between two chainages for at least `duration_s`, with standstill at each end."""
     length = last_m - first_m
     up, down = settings.acceleration_mps2, settings.deceleration_mps2
     top = min(settings.cruise_mps, float(np.sqrt(2.0 * length * up * down / (up + down))))
     cruise_s = max(0.0, (length - top**2 / (2.0 * up) - top**2 / (2.0 * down)) / top)
-    # Phases of a leg in its own direction: acceleration, cruising, braking, standstill.
+    # Phases of a leg, with signs relative to the direction of travel: acceleration, cruising, braking, standstill.
     steps = np.array([top / up, cruise_s, top / down, settings.stand_s])
     offsets = np.array([0.0, top**2 / (2.0 * up), length - top**2 / (2.0 * down), length])
     speeds, accelerations = np.array([0.0, top, top, 0.0]), np.array([up, 0.0, -down, 0.0])
@@ -154,8 +154,8 @@ def shuttle(first_m: float, last_m: float, duration_s: float, settings: RunSetti
 
 
 def run_curve(line: Alignment, settings: RunSettings, duration_s: float, *, contact_m: float) -> Motion:
-    """Return the motion from stop to stop at the highest permitted speed, for at least `duration_s` and to the last
-    stop.
+    """Return the motion from stop to stop at the highest permitted speed. It lasts at least `duration_s` and ends at
+    the last stop of a leg.
 
     `contact_m` is the distance between the contact points of a wheelset, which determines the speed in canted curves.
     """
@@ -235,8 +235,8 @@ class AntennaTruth:
     """True positions of an antenna at n positions of the vehicle."""
 
     ecef_m: Floats  #: Position of the antenna, shape (n, 3).
-    #: Chainage of the centreline point abeam the antenna, in the plane perpendicular to the line between the bogies,
-    #: shape (n,).
+    #: Chainage of the centreline point abeam the antenna, in the plane perpendicular to the straight line through the
+    #: bogie centres, shape (n,).
     chainage_m: Floats
     forward: Floats  #: Unit vector of the longitudinal axis of the body, shape (n, 3).
 
@@ -296,8 +296,8 @@ def antenna_truth(
     return AntennaTruth(ecef_m=place, chainage_m=abeam, forward=forward)
 
 
-FULL_SPEED_MPS: Final = 20.0  #: Speed above which the random motions of the body have full amplitude [m/s].
-_STEP_S: Final = 0.01  #: Time step for the pitch response to accelerations [s].
+FULL_SPEED_MPS: Final = 20.0  #: From this speed on, random motions of the body have full amplitude [m/s].
+_STEP_S: Final = 0.01  #: Time step of the computation of pitch due to accelerations [s].
 _DAMPING: Final = 0.3  #: Damping ratio of the suspension.
 _MARGIN_S: Final = 2.0  #: Pitch is also computed for this time before and after the run [s].
 

@@ -66,7 +66,7 @@ class _FirstOrder:
 class CodeSmoothing:
     """Low-pass filter of code errors: ``y[k] = y[k-1] + (1 - exp(-dt / time)) (x[k] - y[k-1])``.
 
-    The filter restarts at each lock. With a time constant of 0, errors are not filtered.
+    The filter restarts whenever a signal is acquired. With a time constant of 0, errors are not filtered.
     """
 
     def __init__(self, time_s: float, *, channels: int, interval_s: float) -> None:
@@ -95,7 +95,7 @@ class CodeSmoothing:
 class LockState:
     """Lock state of the channels of a receiver over T epochs."""
 
-    lost: Masks  #: Whether the signal is not tracked, shape (T, M).
+    lost: Masks  #: True where the signal is not tracked, shape (T, M).
     #: Whole cycles by which the phase has slipped since the start, shape (T, M); 0.0 without simulated slips.
     slip_cycles: Floats | float
     loss_of_lock: Bytes  #: Loss-of-lock indicator; bit 0 is set at the first epoch after a loss; shape (T, M).
@@ -127,8 +127,8 @@ class TrackingNoise:
         weak = cn0_dbhz < threshold
         if again is None:
             return np.asarray(weak)
-        # The later of the two events (falling below, rising above) determines the state; without an event, the state
-        # before the first epoch remains.
+        # The later of two events determines the state: C/N0 falls below the threshold, or reaches the re-acquisition
+        # C/N0. Without an event, the state before the first epoch is kept.
         epoch = np.arange(1, len(cn0_dbhz) + 1)[:, None]
         fallen = np.maximum.accumulate(np.where(weak, epoch, np.where(self._weak, 0, -1)), axis=0)
         risen = np.maximum.accumulate(
@@ -168,11 +168,11 @@ def _cycles(salt: NDArray[np.uint64], losses: NDArray[np.uint64]) -> Floats:
     return np.where(losses == 0, 0.0, cycles)
 
 
-#: First and second signal of each constellation.
+#: First and second signal of each constellation if `ReceiverSettings.second` is "L2".
 SIGNALS: Final = {"G": ("1C", "2L"), "J": ("1C", "2L"), "E": ("1C", "7Q"), "C": ("2I", "6I")}
-#: First and second signal of each constellation with `ReceiverSettings.second` "L5".
+#: First and second signal of each constellation if `ReceiverSettings.second` is "L5".
 _WITH_L5: Final = {"G": ("1C", "5Q"), "J": ("1C", "5Q"), "E": ("1C", "5Q"), "C": ("1P", "5P")}
-#: Streams of random numbers: white noise, correlated noise, cycle slips, C/N0 differences between satellites.
+#: Seeds of random streams: white noise, correlated noise, cycle slips, C/N0 differences between satellites.
 _WHITE, _CARRIED, _SLIPS, _POWER = 2, 3, 4, 6
 
 
@@ -200,7 +200,7 @@ class Receiver:
         self.column = np.searchsorted(satellites, self.names)
         frequency = np.array([CARRIER_FREQUENCY[n[0]][g[0]] for n, g in channels])
         self.wavelength_m = SPEED_OF_LIGHT / frequency
-        #: Ratio of the ionospheric delay on the signal's frequency to the delay on L1.
+        #: Ratio of the ionospheric delay on each channel's frequency to the delay on L1.
         self.scale = (FREQUENCY_L1 / frequency) ** 2
         self.second = np.array([g != list_signals(n[0], scenario.receiver)[0] for n, g in channels])
         self.group_delay_error_m = common_errors.group_delay_m(self.names.tolist(), self.signals.tolist())
@@ -208,7 +208,7 @@ class Receiver:
         self.offset_m = np.array([o.offset_m + (o.rear_difference_m if antenna == "rear" else 0.0) for o in offsets])
         self.offset_drift_mps = np.array([o.drift_mps for o in offsets])
         sigma = scenario.receiver.cn0_satellite_sigma_db
-        #: Constant C/N0 difference of each satellite, equal for all receivers.
+        #: Constant C/N0 offset of each channel's satellite, equal for all receivers.
         self.cn0_offset_db = sigma * np.array(
             [np.random.default_rng([scenario.seed, _POWER, *satellite_key(n)]).standard_normal() for n in self.names]
         )
@@ -230,7 +230,7 @@ class Receiver:
         return self._rng.standard_normal((epochs, len(self.names), 4))
 
 
-_WALK = 5  #: Stream of random numbers: walks of the receiver clocks.
+_WALK = 5  #: Seed of the random stream for the walks of the receiver clocks.
 
 
 class ReceiverClocks:

@@ -25,7 +25,7 @@ from railfix.simulate.sensor_columns import COLUMNS, sensor_tables
 from railfix.simulate.signals import Simulation
 from railfix.track import write_track_csv
 
-#: Prefixes of settings that the README lists only if they have non-default values.
+#: The README lists settings with these prefixes only if their values differ from the defaults.
 _SHORT = ("errors.", "environment.", "sensors.", "line.generated.", "line.map_error.")
 
 
@@ -96,7 +96,7 @@ def _files(simulation: Simulation, files: dict[str, Path]) -> dict[str, str]:
 
 
 def _list_effects(scenario: Scenario) -> str:
-    """Return README sentences that state which errors, multipath, sensors and SBAS are simulated."""
+    """Return README sentences on the simulated errors, multipath, sensors and SBAS messages."""
     usual = Scenario().errors
     names = list(type(usual).model_fields)
     errors = [name for name in names if getattr(scenario.errors, name) != getattr(usual, name)]

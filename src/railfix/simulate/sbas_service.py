@@ -27,7 +27,7 @@ Field = tuple[int, int]
 #: [2^-31 s].
 LongTerm = tuple[int, int, tuple[float, float, float], float]
 
-#: Resolution of corrections and delays [m].
+#: Resolution of fast corrections and grid delays [m].
 STEP_M: Final = 0.125
 NO_DELAY: Final = 15  #: GIVEI of a grid point that is not monitored.
 #: Fields of message type 10 in order, with the length of each field in bits.
@@ -41,7 +41,7 @@ DEGRADATION: Final = {
 def message(kind: int, second: int, *fields: Field) -> Bytes:
     """Return a message of type `kind` with its parity, as bytes of shape (32,).
 
-    The fields (value, length in bits) begin at bit 14. Raise ValueError if a value does not fit its length.
+    The fields (value, length in bits) begin at bit 14. Raise ValueError if a value does not fit into its field.
     """
     return pack_message(f"{PREAMBLES['L1'][second % 3]:08b}{kind:06b}", kind, fields)
 
@@ -49,7 +49,7 @@ def message(kind: int, second: int, *fields: Field) -> Bytes:
 def pack_message(text: str, kind: int, fields: Sequence[Field]) -> Bytes:
     """Return a message with parity, shape (32,), from the first bits as text and the fields (value, length in bits).
 
-    Raise ValueError if a value does not fit its length, or the message is too long.
+    Raise ValueError if a value does not fit into its field, or the message is too long.
     """
     for value, length in fields:
         if not -(1 << length) < 2 * value + 1 <= (1 << (length + 1)):
@@ -69,7 +69,7 @@ def mask(second: int, numbers: Collection[int], iodp: int = 0) -> Bytes:
 def fast(
     second: int, prc: Sequence[float], udrei: Sequence[int], *, kind: int = 2, iodf: int = 0, iodp: int = 0
 ) -> Bytes:
-    """Return a message of type 0 or 2 to 5, fast corrections [m] with UDREI; remaining slots are not monitored."""
+    """Return a message of fast corrections [m] with UDREI, of type 0 or 2 to 5; remaining slots are not monitored."""
     values = [round(v / STEP_M) for v in prc] + [0] * (13 - len(prc))
     grades = list(udrei) + [NOT_MONITORED] * (13 - len(udrei))
     return message(kind, second, (iodf, 2), (iodp, 2), *((v, 12) for v in values), *((g, 4) for g in grades))
@@ -146,14 +146,14 @@ def grid_delay(
     return message(26, second, (band, 4), (block, 4), *pairs, (iodi, 2))
 
 
-#: Numbers per message: slots in types 2 to 5, satellites in type 25, and grid points in type 26.
+#: Contents of one message: slots in types 2 to 5, satellites in type 25, grid points in type 26.
 _FAST, _LONG_TERM, _DELAYS = 13, 4, 15
-#: Number of slots in message type 24. Type 24 replaces the last fast message if at most this many slots remain.
+#: Number of slots in message type 24. If no more slots remain, the last message of fast corrections has type 24.
 _MIXED: Final = 6
-#: Largest fast correction, orbit correction and grid delay that the fields can represent [m].
+#: Larger fast corrections, orbit corrections and grid delays are clipped to these ranges of their fields [m].
 _LARGEST_FAST_M, _LARGEST_ORBIT_M, _LARGEST_DELAY_M = 255.0, 31.875, 63.75
 FAST_PERIOD_S: Final = 6  #: Interval between two fast corrections of a satellite [s].
-CLOCK, _ORBIT, _DELAY = 50, 51, 52  #: Streams of random numbers: fast corrections, orbits, delays.
+CLOCK, _ORBIT, _DELAY = 50, 51, 52  #: Seeds of random streams: noise of fast, orbit and delay corrections.
 
 
 class Service:
@@ -175,11 +175,11 @@ class Service:
 
     @staticmethod
     def slot(name: str) -> int:
-        """Return the number of a satellite in the mask; 0 for a satellite without corrections (all except GPS)."""
+        """Return the PRN mask number of a satellite; 0 for satellites that are not corrected (all except GPS)."""
         return int(name[1:]) if name[0] == "G" else 0
 
     def _instant(self, second: float) -> Floats:
-        """Return the time of validity of the corrections sent at a second [s], limited to the duration of the run."""
+        """Return the time to which corrections sent at a second refer [s], limited to the duration of the run."""
         return np.asarray(np.clip(np.array([second - self._settings.latency_s]), 0.0, self._last_s))
 
     def fast_m(self, second: float) -> Floats:

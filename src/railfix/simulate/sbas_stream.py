@@ -1,4 +1,4 @@
-"""Simulated SBAS messages, one per second, and the file with these messages; contents of the messages on L5."""
+"""Simulated SBAS messages, one per second, and the file with these messages; contents of L5 messages."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 def message(kind: int, second: int, *fields: Field) -> Bytes:
     """Return an L5 message of type `kind` with its parity, as bytes of shape (32,).
 
-    The fields (value, length in bits) begin at bit 10. Raise ValueError if a value does not fit its length.
+    The fields (value, length in bits) begin at bit 10. Raise ValueError if a value does not fit into its field.
     """
     return pack_message(f"{PREAMBLES['L5'][second % 6]:04b}{kind:06b}", kind, fields)
 
@@ -70,8 +70,8 @@ def correction(
 def changes(second: int, change: Sequence[int], dfrei: Sequence[int] = (), iodm: int = 0) -> Bytes:
     """Return a type 34 message with changes of the DFREI of the satellites in the mask.
 
-    `change` has one value per satellite: 0 for no change, 1 for the next value of `dfrei`, 2 for an increase of the
-    DFREI by one, 3 for "do not use".
+    `change` has one value per satellite: 0 for no change, 1 for a new DFREI (taken from `dfrei` in order), 2 for an
+    increase of the DFREI by one, 3 for "do not use".
     """
     every = [*change, *([0] * (AUGMENTED - len(change)))]
     grades = [*dfrei, *([0] * (7 - len(dfrei)))]
@@ -79,8 +79,8 @@ def changes(second: int, change: Sequence[int], dfrei: Sequence[int] = (), iodm:
 
 
 def integrity(second: int, dfrei: Sequence[int], *, kind: int = 35, iodm: int = 0) -> Bytes:
-    """Return a message of type 35 with the DFREI of the first 53 satellites in the mask, or of type 36 with the other
-    DFREI.
+    """Return a message of type 35 with the DFREI of the first 53 satellites in the mask, or of type 36 with the DFREI
+    of the other satellites.
     """
     count = 53 if kind == 35 else 39
     fields = [(grade, 4) for grade in [*dfrei, *([15] * (count - len(dfrei)))]]
@@ -108,11 +108,11 @@ def parameters(
     )
 
 
-#: Covariance that is sent. Along a line of sight, the sigma of this covariance is 1.03 to 1.06 times the sigma of the
+#: Covariance that is sent: exponent and factor. Along a line of sight, its sigma is 1.03 to 1.06 times the sigma of the
 #: DFREI.
 _COVARIANCE: Final = (3, np.diag([1.0, 1.0, 1.0, 4.0]))
-_LARGEST_M: Final = 63.9  #: Largest clock correction that the field can represent [m].
-_GROWTH_MPS: Final = 0.002  #: Degradation rate of the corrections [m/s].
+_LARGEST_M: Final = 63.9  #: Larger clock corrections are clipped to this, the range of the field [m].
+_GROWTH_MPS: Final = 0.002  #: Degradation rate that is sent for the corrections [m/s].
 
 
 class SimulatedDfmc(Service):
@@ -174,7 +174,7 @@ class SimulatedDfmc(Service):
         )  # fmt: skip
 
 
-LOST: Final = 53  #: Stream of random numbers: lost messages.
+LOST: Final = 53  #: Seed of the random stream for lost messages.
 
 
 def sbas_messages(simulation: Simulation, settings: SbasSettings) -> SbasMessages:

@@ -29,9 +29,9 @@ from railfix.simulate.settings import (
 )
 
 ANTENNAS: Final = ("front", "rear")  #: Antennas of the vehicle, in the order in which their files are written.
-#: Names of the files of a run, which are not allowed as names of reference stations.
+#: Names of the files of a run; reference stations must have other names.
 _FILES: Final = (*ANTENNAS, "nav", "track", "vehicle", "truth", "sections", "scenario", "readme", "sbas")
-LONGEST_S: Final = 8.64e6  #: Largest duration of a run, 100 days [s].
+LONGEST_S: Final = 8.64e6  #: A run must not be longer than this [s]: 100 days.
 
 
 class Station(ScenarioSettings):
@@ -43,7 +43,7 @@ class Station(ScenarioSettings):
 
 
 class SpeedLimit(ScenarioSettings):
-    """Speed limit of the middle of the vehicle on a part of the line."""
+    """Speed limit that applies while the middle of the vehicle is on a part of the line."""
 
     from_m: Finite
     to_m: Finite
@@ -60,15 +60,15 @@ class RunSettings(ScenarioSettings):
     deceleration_mps2: Positive = 0.8
     first_stand_s: NotNegative = 15.0  #: Duration of the standstill at the start of the run.
     stand_s: NotNegative = 10.0  #: Duration of the standstill at each end of the line, if no stations are given.
-    #: Distance from an end of the line at which the middle of the vehicle stops before the train reverses.
+    #: The middle of the vehicle stops at this distance from an end of the line before the train reverses.
     end_margin_m: NotNegative = 20.0
-    #: Stops by rising chainage, including the first and the last; without stations, the train runs from end to end.
+    #: Stops in order of chainage, including the first and the last; without stations, the train runs from end to end.
     stations: tuple[Station, ...] = ()
 
     limits: tuple[SpeedLimit, ...] = ()
-    #: Largest cant deficiency, which limits the speed in curves; None for no limit in curves.
+    #: The speed in curves is limited so that the cant deficiency does not exceed this; None for no limit in curves.
     cant_deficiency_m: Positive | None = None
-    jerk_mps3: Positive | None = None  #: Largest jerk; None for unlimited jerk.
+    jerk_mps3: Positive | None = None  #: Upper limit of the jerk; None for no limit.
     #: Direction of the first leg. The front of the vehicle points to rising chainage in either direction of travel.
     direction: Literal["rising", "falling"] = "rising"
     at_end: Literal["return", "stand"] = "return"  #: Behaviour after the last stop: reverse, or stay at standstill.
@@ -94,12 +94,12 @@ class VehicleSettings(ScenarioSettings):
     gauge_m: Positive = 1.067
     front: Three = (9.1, 0.25, 3.95)
     rear: Three = (-9.1, 0.25, 3.95)
-    length_m: Positive = 23.2  #: Overall length, centred on the middle between the bogies.
-    #: Standard deviation of the random roll at 20 m/s and more; below this speed, proportional to the speed. The
+    length_m: Positive = 23.2  #: Overall length; the middle of the vehicle is midway between the bogies.
+    #: Standard deviation of the random roll at 20 m/s and more; at lower speeds, it is proportional to the speed. The
     #: vehicle file does not contain this value, because it is unknown in practice.
     sway_sigma_deg: NotNegative = 0.0
     sway_period_s: Positive = 1.5  #: Mean period of the roll.
-    #: Standard deviation of the random pitch at 20 m/s and more; below this speed, proportional to the speed.
+    #: Standard deviation of the random pitch at 20 m/s and more; at lower speeds, it is proportional to the speed.
     pitch_sigma_deg: NotNegative = 0.0
     pitch_period_s: Positive = 1.0  #: Mean period of the random pitch, and period of the suspension.
     #: Pitch under constant acceleration, positive if the front rises when the train accelerates toward rising chainage.
@@ -111,18 +111,18 @@ class SkySettings(ScenarioSettings):
     """Satellites and atmosphere."""
 
     #: Letters of the constellations: G (30 satellites in 6 planes), J (3 inclined geosynchronous, 1 geostationary), E
-    #: (24 in 3 planes), C (24 in 3 planes, 3 inclined geosynchronous); with `nav`, the constellations that are used
-    #: from the file.
+    #: (24 in 3 planes), C (24 in 3 planes, 3 inclined geosynchronous); with `nav`, only these constellations of the
+    #: file are used.
     systems: str = "GJE"
-    #: RINEX navigation file, used instead of simulated satellites; in a scenario file, relative to the file's folder.
+    #: RINEX navigation file used instead of simulated satellites; in a scenario file, relative to the scenario file.
     nav: str | None = None
-    cutoff_deg: float = Field(default=5.0, ge=0.0, lt=90.0)  #: Elevation below which no signal is tracked.
-    #: Satellites whose records are unhealthy, except for the record before the run.
+    cutoff_deg: float = Field(default=5.0, ge=0.0, lt=90.0)  #: Satellites below this elevation are not tracked.
+    #: Satellites whose records in force during the run are marked unhealthy.
     unhealthy: tuple[str, ...] = ("G02",)
-    #: Largest number of satellites tracked at an epoch, the highest first; None for no limit.
+    #: At most this number of satellites is tracked at an epoch: those with the highest elevations; None for no limit.
     satellites_at_most: Annotated[int, Field(ge=1)] | None = None
-    ionosphere_scale: NotNegative = 1.0  #: Ionospheric delay as a multiple of the model; 1 leaves no residual error.
-    troposphere_scale: NotNegative = 1.0  #: Tropospheric delay as a multiple of the model; 1 leaves no residual error.
+    ionosphere_scale: NotNegative = 1.0  #: Factor on modelled ionospheric delays; 1 leaves no residual error.
+    troposphere_scale: NotNegative = 1.0  #: Factor on modelled tropospheric delays; 1 leaves no residual error.
 
     @field_validator("systems")
     @classmethod
@@ -145,30 +145,29 @@ class ReceiverSettings(ScenarioSettings):
     C/N0 written to the log.
     """
 
-    #: Number of signals of a satellite, each with code, phase, Doppler and C/N0.
+    #: Number of observed signals per satellite, each with code, phase, Doppler and C/N0.
     signals_per_satellite: Literal[1, 2] = 1
     #: Second signals. "L2" stands for L2C, E5b and B3I. "L5" stands for L5, E5a and B2a; BeiDou satellites then have
     #: B1C instead of B1I, and B-CNAV1 records instead of D1 records.
     second: Literal["L2", "L5"] = "L2"
-    code_sigma_m: NotNegative = 0.5  #: Standard deviation of the code noise at 45 dB-Hz in the zenith.
+    code_sigma_m: NotNegative = 0.5  #: Standard deviation of the code noise at the zenith and 45 dB-Hz.
     phase_sigma_m: NotNegative = 0.002  #: Standard deviation of the carrier-phase noise.
     doppler_sigma_hz: NotNegative = 0.05  #: Standard deviation of the Doppler noise.
     cn0_sigma_dbhz: NotNegative = 0.7  #: Standard deviation of the C/N0 noise.
-    #: Time constant of the low-pass filter that smooths the code's multipath error while the signal is locked, like
-    #: carrier smoothing; 0 for no filter.
+    #: Time constant of a low-pass filter of the code's multipath error, which simulates carrier smoothing and restarts
+    #: when a signal is acquired; 0 for no filter.
     code_smoothing_s: NotNegative = 0.0
     cn0_horizon_dbhz: Finite = CN0_HORIZON_DBHZ  #: C/N0 of an unobstructed signal at the horizon.
-    #: Increase of C/N0 from the horizon to the zenith, proportional to the sine of the elevation.
+    #: C/N0 at the zenith minus C/N0 at the horizon; the increase is proportional to the sine of the elevation.
     cn0_rise_db: Finite = CN0_RISE_DB
     cn0_satellite_sigma_db: NotNegative = 0.0  #: Standard deviation of constant C/N0 differences between satellites.
-    clocks: Literal["separate", "common"] = "separate"  #: Separate clocks of the two receivers, or one clock.
-    #: Clock bias of the front receiver at the start; separate clocks of other receivers have fixed multiples of this
-    #: bias.
+    clocks: Literal["separate", "common"] = "separate"  #: The two receivers have separate clocks, or one clock.
+    #: Clock bias of the front receiver at the start; biases of other receivers with separate clocks are fixed
+    #: multiples.
     clock_bias_s: float = Field(default=1.2e-4, gt=-0.01, lt=0.01)
-    #: Clock drift of the front receiver [s/s]; other receivers have the same multiples as for the bias.
+    #: Clock drift of the front receiver [s/s], multiplied for other receivers by the factors of the bias.
     clock_drift: Finite = 2.0e-7
-    #: With "millisecond", the receivers step their clocks by whole milliseconds, so that the bias stays within half a
-    #: millisecond.
+    #: With "millisecond", the receivers step their clocks by whole milliseconds, so that the bias stays within 0.5 ms.
     clock_steps: Literal["none", "millisecond"] = "none"
 
     @property
@@ -183,9 +182,9 @@ class ReferenceStation(ScenarioSettings):
     #: Name of the station and of its log: a lower-case letter, then lower-case letters, digits and hyphens.
     name: str = Field(default="station", pattern="^[a-z][a-z0-9-]*$")
     chainage_m: Finite = 0.0
-    lateral_m: Finite = 50.0  #: Distance to the right of the track axis.
-    height_m: Finite = 10.0  #: Height above the rails.
-    faults: tuple[SatelliteFault, ...] = ()  #: Range errors of this receiver only, by satellite.
+    lateral_m: Finite = 50.0  #: Distance of the antenna to the right of the track axis.
+    height_m: Finite = 10.0  #: Height of the antenna above the rails.
+    faults: tuple[SatelliteFault, ...] = ()  #: Range errors of satellites that affect only this receiver.
 
 
 class Scenario(ScenarioSettings):
@@ -207,7 +206,7 @@ class Scenario(ScenarioSettings):
     place_seed: Seed = 1
     sensors: SensorSettings | None = None  #: On-board sensors in addition to the receivers; None for no sensors.
     stations: tuple[ReferenceStation, ...] = ()  #: Reference stations whose observations are also written.
-    sbas: SbasSettings | None = None  #: SBAS whose messages correct the simulated errors; None for no SBAS.
+    sbas: SbasSettings | None = None  #: SBAS that broadcasts corrections of the simulated errors; None for no SBAS.
     #: Further disturbances of the signals, set only in Python; they are neither in `describe` nor in scenario files.
     multipath: tuple[Disturbances, ...] = Field(default=(), exclude=True)
 

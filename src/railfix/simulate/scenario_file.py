@@ -39,7 +39,7 @@ from railfix.simulate.alignment import build_alignment
 from railfix.simulate.motion import build_motion
 from railfix.simulate.scenario import Scenario
 
-#: Value of ``duration_s`` for a duration that the run curve determines.
+#: Value of ``duration_s`` for a run that lasts until the last stop of the run curve.
 WHOLE_RUN: Final = "run"
 _FOLDER: Final = Path(__file__).resolve().parent / "scenarios"
 
@@ -50,8 +50,8 @@ class Recipe:
 
     path: Path
     description: str
-    names: tuple[str, ...]  #: Names of the runs; a single empty name if the file is not a recipe.
-    tables: tuple[Mapping[str, Any], ...]  #: Settings of each run, with absolute paths.
+    names: tuple[str, ...]  #: Names of the runs; one empty name if the file has a single run.
+    tables: tuple[Mapping[str, Any], ...]  #: Settings of each run; paths are absolute.
 
     def scenario(self, number: int = 0, *, changes: Mapping[str, Any] | None = None) -> Scenario:
         """Return the scenario of run `number` (from 0); the settings `changes` override the settings of the file.

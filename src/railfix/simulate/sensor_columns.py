@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from railfix.simulate.signals import Simulation
 
 
-_BALISE_NOISE, _MISSED, _WRONG = 44, 45, 46  #: Streams of random numbers: reading error, missed, wrong identity.
+_BALISE_NOISE, _MISSED, _WRONG = 44, 45, 46  #: Seeds of random streams: reading error, missed, wrong identity.
 _STEP_S = 0.1  #: Spacing of the instants between which the passing of a balise is interpolated [s].
 
 
@@ -79,7 +79,7 @@ def balise_tables(simulation: Simulation, settings: BaliseSettings) -> tuple[pl.
     return readings.select("time_gpst", balise="read").sort("time_gpst"), truth
 
 
-_NOISE, _SWAY, _DROPOUTS = 26, 27, 28  #: Streams of random numbers: noise, sway, dropouts.
+_NOISE, _SWAY, _DROPOUTS = 26, 27, 28  #: Seeds of random streams: noise, sway, dropouts.
 
 
 def radar_table(simulation: Simulation, settings: RadarSettings) -> pl.DataFrame:
@@ -120,7 +120,7 @@ def dropouts(settings: RadarSettings, seed: int, duration_s: float) -> list[tupl
     return found
 
 
-#: Streams of random numbers: noise, multipath error, echoes, lost answers.
+#: Seeds of random streams: noise, multipath error, echoes, lost answers.
 _RANGING_NOISE, _POSITION, _ECHO, _LOST = 40, 41, 42, 43
 
 
@@ -176,7 +176,7 @@ def _range_errors_m(settings: RangingSettings, seed: int, number: int, ahead_m: 
     return settings.noise_sigma_m * noise + settings.multipath_sigma_m * position[cell] + echo[cell]
 
 
-#: Columns of each table.
+#: Columns of each table, with descriptions.
 COLUMNS: Final[dict[str, dict[str, str]]] = {
     "tachometer": {
         "time_gpst": "instant of a pulse, GPS time",
@@ -232,8 +232,8 @@ COLUMNS: Final[dict[str, dict[str, str]]] = {
 def sensor_tables(simulation: Simulation) -> dict[str, pl.DataFrame]:
     """Return the tables of the simulated sensors by name; empty if `Scenario.sensors` is None.
 
-    The tables are ``tachometer`` and ``wheel_slips`` (ground truth), ``inertial``, ``radar``, ``ranging`` and
-    ``ranging_units``, ``balises``, ``balise_list`` and ``balise_truth`` (ground truth), with the columns `COLUMNS`;
+    The tables are ``tachometer``, ``inertial``, ``radar``, ``ranging``, ``ranging_units``, ``balises`` and
+    ``balise_list``, and, with ground truth, ``wheel_slips`` and ``balise_truth``; they have the columns `COLUMNS`;
     tables with times are in order of `time_gpst`.
     """
     settings = simulation.scenario.sensors

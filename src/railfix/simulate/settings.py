@@ -49,7 +49,7 @@ def beyond_start(to_m: float, info: ValidationInfo) -> float:
 
 
 def at_least(least: float) -> AfterValidator:
-    """Return a validator of a range of lengths whose smaller end must be at least `least` [m]."""
+    """Return a validator of a pair of lengths, of which the smaller must be at least `least` [m]."""
 
     def check(pair: tuple[float, float]) -> tuple[float, float]:
         if pair[0] < least:
@@ -59,13 +59,13 @@ def at_least(least: float) -> AfterValidator:
     return AfterValidator(check)
 
 
-#: Smallest and largest value of a uniform distribution.
+#: Lower and upper limit of a uniform distribution.
 Between = Annotated[tuple[NotNegative, NotNegative], AfterValidator(_rising)]
 AngleBetween = Annotated[tuple[Finite, Finite], AfterValidator(_rising)]
 
 
 def _gps_time(value: Any) -> np.datetime64:
-    """Return the GPS time of a TOML time, a string or a datetime64.
+    """Return the GPS time that a TOML time, a string or a datetime64 represents.
 
     Raise ValueError for other values.
     """
@@ -121,29 +121,29 @@ class SatelliteErrorSettings(ScenarioSettings):
     clock_time_s: Positive = 3600.0  #: Correlation time of the clock error.
     #: Standard deviation of the Gauss-Markov radial orbit error, true minus broadcast.
     radial_sigma_m: NotNegative = 0.0
-    along_sigma_m: NotNegative = 0.0  #: Standard deviation of the along-track orbit error.
-    cross_sigma_m: NotNegative = 0.0  #: Standard deviation of the cross-track orbit error.
+    along_sigma_m: NotNegative = 0.0  #: Standard deviation of the Gauss-Markov along-track orbit error.
+    cross_sigma_m: NotNegative = 0.0  #: Standard deviation of the Gauss-Markov cross-track orbit error.
     orbit_time_s: Positive = 7200.0  #: Correlation time of the orbit errors.
-    #: Standard deviation of the group-delay error, a constant of each satellite and signal that affects only codes.
+    #: Standard deviation of the group-delay errors, constants of each satellite and signal that affect only codes.
     group_delay_sigma_m: NotNegative = 0.0
 
 
 class IonosphereErrorSettings(ScenarioSettings):
     """Ionospheric delay on L1 in addition to `SkySettings.ionosphere_scale` times the model delay."""
 
-    #: Standard deviation of the Gauss-Markov vertical delay at the first point of the line.
+    #: Standard deviation of the Gauss-Markov vertical L1 delay, added to the model, at the first point of the line.
     vertical_sigma_m: NotNegative = 0.0
-    vertical_time_s: Positive = 1800.0  #: Correlation time of the vertical delay.
-    #: Gradient of the vertical delay with the distance of the pierce point from the first point of the line.
+    vertical_time_s: Positive = 1800.0  #: Correlation time of the added vertical delay.
+    #: Increase of the vertical delay per distance between the pierce point and the first point of the line.
     gradient_mm_per_km: NotNegative = 0.0
-    gradient_azimuth_deg: Finite = 0.0  #: Azimuth in which the delay increases.
+    gradient_azimuth_deg: Finite = 0.0  #: Azimuth in which the vertical delay increases.
 
 
 class TroposphereErrorSettings(ScenarioSettings):
     """Tropospheric delay in addition to `SkySettings.troposphere_scale` times the model delay."""
 
-    zenith_sigma_m: NotNegative = 0.0  #: Standard deviation of the Gauss-Markov zenith delay.
-    zenith_time_s: Positive = 7200.0  #: Correlation time of the zenith delay.
+    zenith_sigma_m: NotNegative = 0.0  #: Standard deviation of the added zenith delay; Gauss-Markov process.
+    zenith_time_s: Positive = 7200.0  #: Correlation time of the added zenith delay.
 
 
 class SatelliteFault(Interval):
@@ -151,14 +151,14 @@ class SatelliteFault(Interval):
 
     satellite: str = Field(pattern=f"^[{SYSTEMS}][0-9]{{2}}$")  #: Name of the satellite, such as "G07".
     step_m: Finite = 0.0  #: Error of code and phase at the start of the interval.
-    ramp_mps: Finite = 0.0  #: Rate at which the error grows after the start.
+    ramp_mps: Finite = 0.0  #: Rate at which the error changes after the start of the interval.
 
 
 class ClockWalkSettings(ScenarioSettings):
     """Random walks of a receiver clock in addition to its constant drift, in metres of range."""
 
-    walk_m_per_sqrt_s: NotNegative = 0.0  #: Standard deviation of the random walk of the bias after one second.
-    #: Standard deviation of the random walk of the drift after one second.
+    walk_m_per_sqrt_s: NotNegative = 0.0  #: Standard deviation, after one second, of the random walk of the bias.
+    #: Standard deviation, after one second, of the random walk of the drift.
     frequency_walk_mps_per_sqrt_s: NotNegative = 0.0
 
 
@@ -167,15 +167,15 @@ class InterSystemSettings(ScenarioSettings):
 
     offset_m: Finite = 0.0  #: Inter-system bias at the start of the run.
     drift_mps: Finite = 0.0  #: Drift of the inter-system bias.
-    #: Bias of the rear receiver minus the bias of the front receiver, with common and with separate clocks.
+    #: Bias of the rear minus bias of the front receiver, whether their clocks are common or separate.
     rear_difference_m: Finite = 0.0
 
 
 class NoiseSettings(ScenarioSettings):
     """Time-correlated receiver noise; the standard deviations are in `ReceiverSettings`."""
 
-    code_correlated_share: Share = 0.0  #: Fraction of the code-noise variance that is correlated in time.
-    #: Correlation time of the code noise. For a code loop of noise bandwidth B it is 1 / (4 B), or 1 s at 0.25 Hz.
+    code_correlated_share: Share = 0.0  #: Fraction of the variance of the code noise that is correlated in time.
+    #: Correlation time of the correlated code noise: 1 / (4 B) for a code loop of noise bandwidth B, 1 s for 0.25 Hz.
     code_correlation_time_s: Positive = 1.0
     #: Standard deviation of the Gauss-Markov variation of C/N0, independent for each channel.
     cn0_wander_sigma_db: NotNegative = 0.0
@@ -188,10 +188,10 @@ class NoiseSettings(ScenarioSettings):
 class TrackingSettings(ScenarioSettings):
     """Loss of lock and re-acquisition."""
 
-    threshold_dbhz: NotNegative | None = None  #: C/N0 below which a signal is lost; None for no such limit.
-    #: C/N0 above which a signal that was lost because of its C/N0 is trackable again; None for `threshold_dbhz`.
+    threshold_dbhz: NotNegative | None = None  #: A signal with a lower C/N0 is lost; None for no limit.
+    #: A signal that was lost because of its C/N0 is trackable again from this C/N0 on; None means `threshold_dbhz`.
     reacquisition_dbhz: NotNegative | None = None
-    reacquisition_s: NotNegative = 0.0  #: Time for which a lost signal remains absent after it is trackable again.
+    reacquisition_s: NotNegative = 0.0  #: A lost signal remains absent for this time after it is trackable again.
     #: With "after_loss", the phase changes by a random number of whole cycles at each loss of lock, and bit 0 of the
     #: loss-of-lock indicator is set at the first epoch after the loss.
     slips: Literal["none", "after_loss"] = "none"
@@ -200,7 +200,7 @@ class TrackingSettings(ScenarioSettings):
 class ErrorSettings(ScenarioSettings):
     """Satellite, atmospheric and receiver errors; none by default."""
 
-    #: Broadcast errors by the letter of the constellation.
+    #: Satellite errors by the letter of the constellation.
     satellites: dict[System, SatelliteErrorSettings] = Field(default_factory=dict)
 
     ionosphere: IonosphereErrorSettings = IonosphereErrorSettings()
@@ -219,7 +219,7 @@ class SlipInterval(Interval):
 
     end_s: Finite
     #: (Wheel speed - train speed) / train speed in the middle of the interval, positive for a slip, negative for a
-    #: slide, -1 for a locked wheel. Over the interval the value is half a sine wave.
+    #: slide, -1 for a locked wheel. Over the interval, the ratio follows half a sine wave.
     ratio: float = Field(ge=-1.0, allow_inf_nan=False)
 
 
@@ -244,8 +244,8 @@ class TachometerSettings(ScenarioSettings):
     diameter_error_m: Finite = 0.0  #: True minus nominal wheel diameter.
     resolution_s: NotNegative = 0.0  #: Resolution of the pulse times; 0 for one nanosecond.
     jitter_s: NotNegative = 0.0  #: Standard deviation of the white noise of the pulse times.
-    lowest_mps: NotNegative = 0.0  #: Speed of the wheel below which no pulses are sent.
-    #: Standard deviation of the position errors of the teeth, as a fraction of their spacing; equal in every turn.
+    lowest_mps: NotNegative = 0.0  #: Below this wheel speed, no pulses are sent.
+    #: Standard deviation of the position errors of the teeth, which repeat every turn, as a fraction of tooth spacing.
     tooth_sigma: float = Field(default=0.0, ge=0.0, le=0.2)
     lost_chance: Share = 0.0  #: Probability that a pulse is not detected.
     doubled_chance: Share = 0.0  #: Probability that a pulse is followed by a second pulse before the next tooth.
@@ -271,18 +271,18 @@ class InertialSettings(ScenarioSettings):
     """Three accelerometers and three gyroscopes fixed to the body, with the axes forward, right and down."""
 
     rate_hz: Positive = 100.0  #: Sampling rate.
-    along_m: Finite = 0.0  #: Position in the body along the forward axis, as for the antennas.
-    across_m: Finite = 0.0  #: Position in the body to the right.
-    up_m: Finite = 1.0  #: Height above the rail tops.
+    along_m: Finite = 0.0  #: Position of the unit in the body along the forward axis, as for the antennas.
+    across_m: Finite = 0.0  #: Position of the unit in the body to the right.
+    up_m: Finite = 1.0  #: Height of the unit above the rail tops.
     accel_bias_mps2: Three = (0.0, 0.0, 0.0)  #: Constant biases of the accelerometers.
     gyro_bias_radps: Three = (0.0, 0.0, 0.0)  #: Constant biases of the gyroscopes.
     #: Standard deviation of the Gauss-Markov part of each accelerometer bias.
     accel_drift_sigma_mps2: NotNegative = 0.0
-    accel_drift_time_s: Positive = 1000.0  #: Correlation time of the accelerometer biases.
+    accel_drift_time_s: Positive = 1000.0  #: Correlation time of the Gauss-Markov accelerometer biases.
     #: Standard deviation of the Gauss-Markov part of each gyroscope bias.
     gyro_drift_sigma_radps: NotNegative = 0.0
-    gyro_drift_time_s: Positive = 1000.0  #: Correlation time of the gyroscope biases.
-    #: Standard deviation of the random walk of each gyroscope bias after one second, from 0 at the start.
+    gyro_drift_time_s: Positive = 1000.0  #: Correlation time of the Gauss-Markov gyroscope biases.
+    #: Standard deviation, after one second, of the random walk of each gyroscope bias; the walk begins at 0.
     gyro_drift_walk_radps_per_sqrt_s: NotNegative = 0.0
     velocity_walk_mps_per_sqrt_s: NotNegative = 0.0  #: White noise of the accelerometers, as velocity random walk.
     angle_walk_rad_per_sqrt_s: NotNegative = 0.0  #: White noise of the gyroscopes, as angle random walk.
@@ -291,10 +291,10 @@ class InertialSettings(ScenarioSettings):
     misalignment_rad: Three = (0.0, 0.0, 0.0)  #: Rotation of the unit relative to the body, as a rotation vector.
     accel_resolution_mps2: NotNegative = 0.0  #: Quantisation step of the accelerometers; 0 for no quantisation.
     gyro_resolution_radps: NotNegative = 0.0  #: Quantisation step of the gyroscopes; 0 for no quantisation.
-    #: Standard deviation of the vibration of each accelerometer axis at 20 m/s and more; below this speed, proportional
-    #: to the speed.
+    #: Standard deviation of the vibration on each accelerometer axis at 20 m/s and more; at lower speeds, it is
+    #: proportional to the speed.
     vibration_sigma_mps2: NotNegative = 0.0
-    vibration_sigma_radps: NotNegative = 0.0  #: Vibration sigma of each gyroscope axis at 20 m/s and more.
+    vibration_sigma_radps: NotNegative = 0.0  #: As `vibration_sigma_mps2`, on each gyroscope axis.
     #: Mean frequency of the vibration, with a relative bandwidth of 15 %. Frequencies above half of `rate_hz` are
     #: aliased.
     vibration_hz: Positive = 12.0
@@ -311,16 +311,16 @@ class RadarSettings(ScenarioSettings):
 
     rate_hz: Positive = 10.0
     bias_mps: Finite = 0.0
-    scale: Finite = 0.0  #: Scale-factor error, measured / true - 1, as caused by an error of the mounting angle.
+    scale: Finite = 0.0  #: Scale-factor error, measured / true - 1, for example due to the mounting angle.
     noise_sigma_mps: NotNegative = 0.0  #: Standard deviation of the white noise.
-    #: Standard deviation of the Gauss-Markov part of the scale-factor error, caused by pitching of the body.
+    #: Standard deviation of the Gauss-Markov part of the scale-factor error; this part is due to pitching of the body.
     sway_ratio_sigma: NotNegative = 0.0
-    sway_time_s: Positive = 0.5  #: Correlation time of the Gauss-Markov part.
-    lowest_mps: NotNegative = 0.0  #: Lowest speed that is measured.
-    highest_mps: Positive = 200.0 / 3.6  #: Highest speed that is measured.
+    sway_time_s: Positive = 0.5  #: Correlation time of the Gauss-Markov part of the error.
+    lowest_mps: NotNegative = 0.0  #: Lower speeds are not measured.
+    highest_mps: Positive = 200.0 / 3.6  #: Higher speeds are not measured.
 
     dropouts: tuple[Dropout, ...] = ()  #: Specified dropouts.
-    dropouts_per_hour: NotNegative = 0.0  #: Mean number of random dropouts, with exponentially distributed intervals.
+    dropouts_per_hour: NotNegative = 0.0  #: Mean number of random dropouts; times between them are exponential.
     dropout_duration_s: Positive = 5.0  #: Mean of the exponentially distributed durations of random dropouts.
 
 
@@ -329,8 +329,8 @@ class GroundUnit(ScenarioSettings):
 
     name: str = Field(min_length=1)
     chainage_m: Finite
-    lateral_m: Finite = 3.0  #: Distance to the right of the track axis.
-    height_m: Finite = 3.0  #: Height above the rails.
+    lateral_m: Finite = 3.0  #: Distance of the unit to the right of the track axis.
+    height_m: Finite = 3.0  #: Height of the unit above the rails.
     delay_bias_m: Finite = 0.0  #: Range error caused by an error of the constant response delay.
 
 
@@ -339,17 +339,17 @@ class RangingSettings(ScenarioSettings):
 
     units: tuple[GroundUnit, ...] = ()
     interval_s: Positive = 0.2
-    reach_m: Positive = 100.0  #: Largest range that is measured.
+    reach_m: Positive = 100.0  #: Longer ranges are not measured.
     along_m: Finite = 9.0  #: Position of the vehicle's unit along the forward axis, as for the antennas.
     across_m: Finite = 0.0  #: Position of the vehicle's unit to the right.
     up_m: Finite = 3.0  #: Height of the vehicle's unit above the rail tops.
     noise_sigma_m: NotNegative = 0.0  #: Standard deviation of the white noise.
-    #: Standard deviation of the multipath error, which is constant and independent in each cell along the line.
+    #: Standard deviation of the multipath error: constant in a cell along the line, independent between cells.
     multipath_sigma_m: NotNegative = 0.0
-    multipath_cell_m: Positive = 0.25  #: Length of a cell of constant multipath error.
+    multipath_cell_m: Positive = 0.25  #: Length of a cell along the line.
     echo_chance: Share = 0.0  #: Fraction of the cells in which an echo is measured instead of the direct path.
     echo_delay_m: NotNegative = 0.8  #: Mean of the exponentially distributed excess path of an echo.
-    lost_chance: Share = 0.0  #: Probability that a response is lost.
+    lost_chance: Share = 0.0  #: Probability that a ground unit's response is lost.
 
     @field_validator("units")
     @classmethod
@@ -374,15 +374,15 @@ class BaliseSettings(ScenarioSettings):
     #: Spacing of additional balises along the line, named B001, B002 and so on; 0 for no additional balises.
     spacing_m: NotNegative = 0.0
     along_m: Finite = 0.0  #: Position of the reader in the body along the forward axis, as for the antennas.
-    noise_sigma_m: NotNegative = 0.0  #: Standard deviation of the error of a reading along the line.
+    noise_sigma_m: NotNegative = 0.0  #: Standard deviation of the position error of a reading along the line.
     missed: tuple[str, ...] = ()  #: Names of balises that are not read.
-    wrong: dict[str, str] = Field(default_factory=dict)  #: Wrong identities that are read, by balise name.
+    wrong: dict[str, str] = Field(default_factory=dict)  #: Identities read instead of a balise's name, by name.
     missed_chance: Share = 0.0  #: Probability that a balise is never read.
     wrong_chance: Share = 0.0  #: Probability that a balise is always read with the identity of another balise.
 
 
 class SensorSettings(ScenarioSettings):
-    """On-board sensors; None means that the vehicle has no such sensor."""
+    """On-board sensors; the vehicle lacks a sensor that is None."""
 
     tachometer: TachometerSettings | None = TachometerSettings()
     inertial: InertialSettings | None = InertialSettings()
@@ -396,17 +396,17 @@ class SbasSettings(ScenarioSettings):
 
     band: Literal["L1", "L5"] = "L1"  #: L5 requires receivers with ``signals_per_satellite = 2, second = "L5"``.
     prn: Annotated[int, Field(ge=120, le=158)] = 137
-    latency_s: NotNegative = 4.0  #: Time from the validity of a correction to the first bit of its message.
+    latency_s: NotNegative = 4.0  #: Time from the instant to which a correction refers to the first bit of its message.
     udrei: Annotated[int, Field(ge=0, le=13)] = 5  #: UDREI that is sent for all satellites on L1.
     givei: Annotated[int, Field(ge=0, le=14)] = 9  #: GIVEI that is sent for all grid points.
     dfrei: Annotated[int, Field(ge=0, le=14)] = 5  #: DFREI that is sent for all satellites on L5.
     clock_sigma_m: NotNegative = 0.0  #: Standard deviation of the white error of each clock correction.
     orbit_sigma_m: NotNegative = 0.0  #: Standard deviation of the white error of each axis of an orbit correction.
     delay_sigma_m: NotNegative = 0.0  #: Standard deviation of the white error of each grid delay.
-    #: Largest difference in latitude and in longitude between a grid point in the mask and the start of the line.
+    #: The mask has the grid points whose latitude and longitude differ from the start of the line by at most this.
     grid_radius_deg: Positive = 25.0
-    alert_m: Positive = 10.0  #: Range error of a faulty satellite above which the satellite is set to "do not use".
-    alert_s: NotNegative = 6.0  #: Time from the error exceeding `alert_m` to "do not use".
+    alert_m: Positive = 10.0  #: A satellite with a larger range error due to a fault is set to "do not use".
+    alert_s: NotNegative = 6.0  #: Time from a range error above `alert_m` to the first "do not use".
     lost_chance: Share = 0.0  #: Probability that a message is not received.
-    #: Time by which the messages begin before the run, so that all corrections are available when the run starts.
+    #: The messages begin this time before the run, so that all corrections are available when the run starts.
     lead_s: NotNegative = 300.0

@@ -1,8 +1,8 @@
 """Simulated observations of all receivers, composed of ranges, clocks, delays, errors and noise.
 
-Ionospheric delays follow Klobuchar's model (IS-GPS-200, 20.3.3.5.2.5), tropospheric delays follow Saastamoinen's model
-with the standard atmosphere and 70 % relative humidity. A receiver that applies these models corrects the delays
-exactly, unless a scale or an error of the scenario changes them.
+Ionospheric delays follow Klobuchar's model (IS-GPS-200, 20.3.3.5.2.5); tropospheric delays follow Saastamoinen's model
+for the standard atmosphere with 70 % relative humidity. A receiver that applies these models corrects the delays
+exactly, unless the scenario scales the delays or adds errors to them.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ from railfix.simulate.receiver import Receiver, ReceiverClocks, list_signals
 from railfix.simulate.scenario import ANTENNAS, Scenario
 
 CN0_STEP_DBHZ: Final = 0.25  #: Resolution of the reported C/N0 [dB-Hz].
-CHUNK_EPOCHS: Final = 2000  #: Number of epochs of a chunk.
+CHUNK_EPOCHS: Final = 2000  #: Number of epochs in a chunk.
 _LOOK_S: Final = 60.0  #: Interval at which satellite elevations are compared with the cutoff [s].
-_RATE_S: Final = 0.005  #: Half the time step of the differences from which range rates are computed [s].
+_RATE_S: Final = 0.005  #: Range rates are computed from differences over twice this time [s].
 _SIGMA_AT_DBHZ: Final = 45.0  #: C/N0 to which the sigmas of `ReceiverSettings` refer [dB-Hz].
-_BEST_DBHZ: Final = 50.0  #: C/N0 above which the noise is constant [dB-Hz].
+_BEST_DBHZ: Final = 50.0  #: Above this C/N0, the noise is constant [dB-Hz].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,13 +49,13 @@ class Piece:
     clock_m: Floats  #: Receiver clock bias times the speed of light, shape (T,).
     code_sigma_m: Floats  #: Standard deviation of the code noise, shape (T, M).
     clean_code_m: Floats  #: Codes without noise and without disturbances, shape (T, M).
-    error_m: Floats  #: Part of `clean_code_m` that `Scenario.errors` adds and no model corrects, shape (T, M).
+    error_m: Floats  #: Part of `clean_code_m` due to `Scenario.errors`, which models do not correct, shape (T, M).
 
 
 class Simulation:
     """Simulation of a scenario: line, motion, satellites, and observations in chunks.
 
-    The constructor raises the errors of `build_alignment`, `build_motion` and `simulate_navigation`.
+    The constructor raises the exceptions that `build_alignment`, `build_motion` and `simulate_navigation` raise.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -188,10 +188,10 @@ class _Instant:
 
     elevation_deg: Floats
     azimuth_deg: Floats
-    path_m: Floats  #: Range plus tropospheric delay and `path_error_m`, minus the satellite clock.
+    path_m: Floats  #: Range + tropospheric delay + `path_error_m` - satellite clock.
     ionosphere_m: Floats  #: Ionospheric delay on L1, including `ionosphere_error_m`.
     path_error_m: Floats  #: Sum of the errors of orbit, satellite clock and troposphere.
-    ionosphere_error_m: Floats  #: Error of the ionospheric delay on L1.
+    ionosphere_error_m: Floats  #: Part of the ionospheric delay on L1 that the model lacks.
 
 
 def _instant(simulation: Simulation, time: Datetimes, late_s: Floats, antenna_ecef_m: Floats) -> _Instant:
@@ -227,7 +227,7 @@ def _instant(simulation: Simulation, time: Datetimes, late_s: Floats, antenna_ec
 
 
 def _geometry(simulation: Simulation, antenna: str, time: Datetimes) -> tuple[SightGeometry, _Instant, Floats, Floats]:
-    """Return the geometry by satellite, the delays at the epochs, and the rates of path and ionospheric delay [m/s].
+    """Return geometry and delays of all satellites at T epochs, and the rates of path and ionospheric delay [m/s].
 
     The rates are computed from differences over 10 ms.
     """
@@ -335,7 +335,7 @@ def _disturb(
 
 
 def _faults(simulation: Simulation, receiver: Receiver, tag_s: Floats) -> tuple[Floats, Floats]:
-    """Return range errors due to faults of satellites and a station's receiver [m], and their rates [m/s], (T, M)."""
+    """Return range errors [m], due to satellites and due to a station's receiver, and their rates [m/s], (T, M)."""
     names = receiver.names.tolist()
     fault, rate = fault_m(simulation.scenario.errors.faults, tag_s, names)
     for station in simulation.scenario.stations:
@@ -346,7 +346,7 @@ def _faults(simulation: Simulation, receiver: Receiver, tag_s: Floats) -> tuple[
 
 
 def _is_tracked(elevation_deg: Floats, scenario: Scenario) -> Masks:
-    """Return whether satellites are above the cutoff and among the highest `satellites_at_most`, shape (T, S)."""
+    """Return whether satellites are above the cutoff and among the `satellites_at_most` highest ones, shape (T, S)."""
     tracked = elevation_deg >= scenario.sky.cutoff_deg
     most = scenario.sky.satellites_at_most
     if most is not None and most < elevation_deg.shape[1]:

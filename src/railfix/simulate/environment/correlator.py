@@ -2,8 +2,8 @@
 
 The code error of the coherent loop is the zero of ``Re(conj(P) (E - L))``, where E, L and P are the sums of all paths
 in the early, late and prompt correlators (Irsigler 2008, 4.1; Braasch in Parkinson & Spilker 1996, vol. I, ch. 14). The
-autocorrelation is a triangle, as for unlimited bandwidth. Where the triangle is linear for all paths, the zero is a
-quotient, so that a few iterations suffice.
+autocorrelation is a triangle, as for unlimited bandwidth. Between the corners of the triangle, the zero is the quotient
+of two sums; a few iterations therefore suffice.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from railfix.simulate.environment.settings import AntennaSettings, CorrelatorSet
 
 Singles = NDArray[np.float32]
 
-#: Number of iterations with a narrow correlator; three suffice for errors of a few hundredths of a chip.
+#: Number of iterations with a narrow correlator, whose code errors are at most a few hundredths of a chip.
 _ROUNDS_NARROW: Final = 3
 _ROUNDS_WIDE: Final = 12  #: Number of iterations with a wide correlator.
-_NARROW_CHIPS: Final = 0.2  #: Largest early-late spacing of a narrow correlator [chips].
+_NARROW_CHIPS: Final = 0.2  #: A correlator counts as narrow up to this early-late spacing [chips].
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,8 +34,8 @@ class TrackedCode:
 
     code_m: Floats  #: Delay of the code.
     phase_m: Floats  #: Delay of the carrier phase.
-    rate_mps: Floats  #: Rate of change of `phase_m`, with constant path amplitudes.
-    gain_db: Floats  #: Amplitude of the prompt correlator.
+    rate_mps: Floats  #: Rate of change of `phase_m`, computed for constant path amplitudes.
+    gain_db: Floats  #: Amplitude of the prompt correlator, as a change of C/N0.
     main: Indices  #: Index of the path to which the loops lock.
 
 
@@ -113,8 +113,8 @@ def _zero(real: Singles, imaginary: Singles, late: Singles, follow: Singles, spa
         away = np.abs(x)
         triangle = _triangle(x)
         carrier, quadrature = (real * triangle).sum(axis=0), (imaginary * triangle).sum(axis=0)
-        # Component of each path in phase with the sum of the paths. The product of a path with itself is constant; the
-        # products of different paths oscillate.
+        # Component of each path in phase with the sum of the paths. The product of a path with itself is constant over
+        # time; the products of two different paths oscillate.
         in_phase = follow * (real * carrier + imaginary * quadrature) + own * triangle
         near = away < half
         # For a path at x, early minus late is -2 x near zero, then constant, and falls to 0 beyond one chip.

@@ -45,7 +45,7 @@ from railfix.simulate.environment.walls import (
     street_reflections,
 )
 
-_LEAST_WEIGHT: Final = 0.005  #: Obstructions with a smaller weight are neglected.
+_LEAST_WEIGHT: Final = 0.005  #: An obstruction is neglected if the weight of its field is smaller than this.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,13 +55,13 @@ class Conductor:
     The coordinates are relative to the antenna; the axes p and q are perpendicular to the conductor.
     """
 
-    p: Floats  #: Coordinate p of the conductor, shape (N,) [m].
-    q: Floats  #: Coordinate q of the conductor, shape (N,) [m].
+    p: Floats  #: Coordinate p of the conductor relative to the antenna, shape (N,) [m].
+    q: Floats  #: Coordinate q of the conductor relative to the antenna, shape (N,) [m].
     ray_p: Floats  #: Component p of the unit vector to the satellite, shape (N,).
     ray_q: Floats  #: Component q of the unit vector to the satellite, shape (N,).
-    ray_axis: Floats  #: Component of the unit vector to the satellite along the conductor, shape (N,).
-    low_m: Floats | float  #: Coordinate of the lower end along the axis of the conductor.
-    high_m: Floats | float  #: Coordinate of the upper end along the axis of the conductor.
+    ray_axis: Floats  #: Component, along the conductor, of the unit vector to the satellite, shape (N,).
+    low_m: Floats | float  #: Coordinate of the lower end, along the conductor, relative to the antenna.
+    high_m: Floats | float  #: Coordinate of the upper end, along the conductor, relative to the antenna.
     width_m: float
 
     def obstruction(self, wavelength_m: Floats) -> Complexes:
@@ -85,11 +85,11 @@ class Conductor:
     def scatter(self, wavelength_m: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Return amplitude, extra path [m] and direction (p, q) of the signal scattered to the antenna.
 
-        Only conductors on the side opposite the satellite scatter. A metal cylinder scatters the amplitude sqrt(a
-        cos(b/2) / (2 rho)) in geometrical optics, with radius a, distance rho and bistatic angle b; half of the
-        scattered power has the antenna's polarisation. The extra path is rho c (1 - cos(phi)), where c is the component
-        of the ray perpendicular to the conductor and phi the angle between this component and the direction to the
-        conductor.
+        A conductor scatters only if the antenna is between conductor and satellite. A metal cylinder scatters the
+        amplitude sqrt(a cos(b/2) / (2 rho)) in geometrical optics, with radius a, distance rho and bistatic angle b;
+        half of the scattered power has the antenna's polarisation. The extra path is rho c (1 - cos(phi)), where c is
+        the component of the ray perpendicular to the conductor and phi the angle between this component and the
+        direction to the conductor.
         """
         plane = np.sqrt(self.ray_p**2 + self.ray_q**2) + 1e-9
         away = np.hypot(self.p, self.q)
@@ -115,7 +115,7 @@ class Electrification:
         self.settings = settings
 
     def _number(self, chainage_m: Floats, every: int) -> Floats:
-        """Return the chainage of the nearest mast; only each `every`-th mast counts."""
+        """Return the chainage of the mast that is nearest among every `every`-th mast."""
         spacing = self.settings.spacing_m * every
         return self.settings.first_m + spacing * np.rint((chainage_m - self.settings.first_m) / spacing)
 
@@ -199,19 +199,19 @@ class Electrification:
 
 #: Chip length divided by the length of a C/A chip, by constellation and band; 1 for other signals (BPSK(1), BOC(1,1)).
 CHIP_RATIO: Final = {"C2": 0.5, "C6": 0.1, "E7": 0.1, "E5": 0.1, "E8": 0.1, "G5": 0.1, "J5": 0.1, "C5": 0.1, "C7": 0.1}
-ANTENNAS: Final = ("front", "rear")  #: Antennas of the vehicle.
-_NO_FIELD: Final = 0.01  #: Amplitude below which reflections are neglected.
+ANTENNAS: Final = ("front", "rear")  #: Names of the antennas of the vehicle.
+_NO_FIELD: Final = 0.01  #: Reflections with a smaller amplitude are neglected.
 PLATFORM_M: Final = 1.1  #: Height of platforms above the rails [m].
 _HARMONICS: Final = 4  #: Number of harmonics of the gain ripple over azimuth.
-_BLOCK: Final = 8192  #: Number of signals computed in one step, so that their arrays fit into the processor's cache.
-_LEAST_ELEVATION_DEG: Final = 0.5  #: Lowest elevation for which signals are computed [deg].
+_BLOCK: Final = 8192  #: Number of signals computed in one step; their arrays fit into the processor's cache.
+_LEAST_ELEVATION_DEG: Final = 0.5  #: Multipath and blockage are computed only above this elevation [deg].
 
 
 class Environment:
     """Multipath and blockage along a line.
 
     `clear_cn0_dbhz` has the C/N0 of an unobstructed signal at the horizon, and the increase of C/N0 from the horizon to
-    the zenith. Structures and, with `EnvironmentSettings.shares`, sections are drawn from the seed.
+    the zenith. Structures are drawn from the seed; if `EnvironmentSettings.shares` is given, sections are drawn too.
     """
 
     def __init__(
@@ -279,7 +279,7 @@ class Environment:
     def _paths(self, rays: Rays, platform: Masks, clock_s: Floats) -> tuple[Complexes, Floats, Floats]:
         """Return complex amplitudes, extra paths [m] and their growth [m/m] of all P paths of N signals, shapes (P, N).
 
-        Amplitudes are relative to the unobstructed direct signal; growth is with the chainage of the antenna.
+        Amplitudes are relative to the unobstructed direct signal; growth is per metre of the antenna's chainage.
         """
         field, delay = self._direct(rays, clock_s)
         nothing = np.zeros(len(rays.x))
@@ -298,8 +298,8 @@ class Environment:
         return np.stack([field.astype(np.complex128) for field in fields]), np.stack(extra_m), np.stack(growth)
 
     def _further(self, rays: Rays, clock_s: Floats) -> list[tuple[Floats | Complexes, Floats, Floats]]:
-        """Return the reflections by walls of side streets, by rows on both sides of the line in sequence, and by other
-        vehicles.
+        """Return the reflections by walls of side streets, by other vehicles, and by two rows on opposite sides of the
+        line (double reflections).
         """
         settings, antenna = self.settings, self.settings.antenna
         rows: list[tuple[Floats | Complexes, Floats, Floats]] = []
@@ -319,7 +319,7 @@ class Environment:
         return rows
 
     def _direct(self, rays: Rays, clock_s: Floats) -> tuple[Complexes, Floats]:
-        """Return the direct field and the excess path of diffraction [m], shapes (N,).
+        """Return the direct field and its excess path due to diffraction [m], shapes (N,).
 
         Only the most obstructing of several walls and vehicles is used.
         """
@@ -347,8 +347,8 @@ class Environment:
     def _reflection(self, r: int, rays: Rays) -> tuple[Floats, Floats, Floats]:
         """Return amplitude, extra path [m] and growth [m/m] of the reflection by row `r` of walls, shapes (N,).
 
-        The incident ray may be obstructed by all rows on the side of the satellite, the reflected ray by the nearer
-        rows on the side of the reflection.
+        Any row on the satellite's side may obstruct the incident ray; rows nearer than the wall may obstruct the
+        reflected ray.
         """
         image = reflections(self.structures.walls[r], rays)
         amplitude = image.amplitude.copy()

@@ -1,4 +1,4 @@
-"""Settings of the structures along a line that block, reflect and scatter signals; none by default.
+"""Settings of the structures along a line that block, reflect and scatter signals; by default, there are no structures.
 
 In a scenario file::
 
@@ -53,26 +53,26 @@ class ElectrificationSettings(ScenarioSettings):
     lateral_m: Positive = 3.0  #: Distance of the axis of a mast from the track axis.
     width_m: Positive = 0.35  #: Width of a mast.
     height_m: Positive = 9.0  #: Height of the top of a mast above the rails.
-    beam_every: int = Field(default=1, ge=0)  #: Beams: 1 at every mast, 2 at every second mast, and so on; 0 for none.
+    beam_every: int = Field(default=1, ge=0)  #: Beams are at every mast (1), every second mast (2) ...; 0 for none.
     beam_height_m: Positive = 7.5  #: Height of the middle of a beam above the rails.
-    beam_depth_m: Positive = 0.4  #: Depth of a beam.
+    beam_depth_m: Positive = 0.4  #: Depth of a beam, from its lower to its upper edge.
     wire_height_m: Positive = 5.1  #: Height of the contact wire above the rails, over the track axis.
     wire_width_m: Positive = 0.012  #: Width of the contact wire and of the messenger wire.
     messenger_height_m: Positive = 6.0  #: Height of the messenger wire above the rails.
 
 
 class RowSettings(ScenarioSettings):
-    """Row of walls along the line (buildings, slopes, mountains); pairs are ranges of uniform distributions."""
+    """Row of walls along the line (buildings, slopes, mountains); a pair of numbers limits a uniform distribution."""
 
     sides: Sides = "both"
     distance_m: Between = (10.0, 30.0)  #: Distance of the wall from the track axis.
-    height_m: Between = (6.0, 15.0)  #: Height of the top above the rails.
-    length_m: Between = (10.0, 30.0)  #: Length along the line.
-    gap_m: Between = (2.0, 10.0)  #: Gap to the next wall.
+    height_m: Between = (6.0, 15.0)  #: Height of the top of a wall above the rails.
+    length_m: Between = (10.0, 30.0)  #: Length of a wall along the line.
+    gap_m: Between = (2.0, 10.0)  #: Distance from the end of a wall to the next wall.
     share: Share = 1.0  #: Fraction of the building plots that have a wall.
     #: Amplitude reflection coefficient, from 0 to 1. Without `AntennaSettings`, it includes the effect of polarisation.
     reflection: Between = (0.2, 0.7)
-    roughness_m: Between = (0.0, 0.02)  #: Standard deviation of the surface height.
+    roughness_m: Between = (0.0, 0.02)  #: Standard deviation of the wall's surface height.
     yaw_deg: AngleBetween = (-4.0, 4.0)  #: Yaw of the wall relative to the direction of the line.
 
     @field_validator("distance_m", "length_m", "reflection", "yaw_deg")
@@ -91,9 +91,9 @@ class RoofSettings(ScenarioSettings):
 
     sides: Sides = "both"
     inner_m: NotNegative = 1.8  #: Distance of the inner edge from the track axis; 0 for a roof that covers the track.
-    outer_m: float = Field(default=9.0, gt=0.0, validate_default=True)  #: Distance of the outer edge.
-    height_m: Positive = 6.0  #: Height above the rails.
-    length_m: Annotated[Between, at_least(1.0)] = (60.0, 120.0)  #: Range of the uniformly distributed lengths.
+    outer_m: float = Field(default=9.0, gt=0.0, validate_default=True)  #: Distance of the outer edge from the axis.
+    height_m: Positive = 6.0  #: Height of the roof above the rails.
+    length_m: Annotated[Between, at_least(1.0)] = (60.0, 120.0)  #: Range of the uniformly distributed lengths of roofs.
     gap_m: Between = (10.0, 40.0)  #: Range of the uniformly distributed gaps to the next roof.
     loss_db: NotNegative = 25.0  #: Loss of signals through the roof.
 
@@ -108,8 +108,8 @@ class RoofSettings(ScenarioSettings):
 class SectionSettings(ScenarioSettings):
     """Section of the line with one kind of surroundings."""
 
-    from_m: Finite  #: Chainage of the start.
-    to_m: Finite  #: Chainage of the end.
+    from_m: Finite  #: Chainage at which the section begins.
+    to_m: Finite  #: Chainage at which the section ends.
     kind: Kind  #: Kind of section, one of `KINDS`, which determines the usual walls and roofs.
     rows: tuple[RowSettings, ...] | None = None  #: Rows of walls; None for the usual rows of the kind.
     roofs: tuple[RoofSettings, ...] | None = None  #: Roofs; None for the usual roofs of the kind.
@@ -122,25 +122,25 @@ class CorrelatorSettings(ScenarioSettings):
 
     chip_m: Positive = 293.05  #: Length of a C/A chip; the chips of faster codes are shorter in proportion.
     spacing_chips: float = Field(default=0.1, gt=0.0, le=1.0)  #: Early-late spacing of the correlator.
-    tracking_cn0_dbhz: Finite = 20.0  #: C/N0 below which a signal is lost.
+    tracking_cn0_dbhz: Finite = 20.0  #: A signal is lost if its C/N0 is lower than this.
     code_loop_hz: Positive = 1.0  #: Bandwidth of the code loop; faster multipath fading is averaged.
     carrier_loop_hz: Positive = 10.0  #: Bandwidth of the carrier loop.
     backward_db: Finite = 15.0  #: Loss of the antenna for signals from below the horizon.
 
 
 class AntennaSettings(ScenarioSettings):
-    """Polarisation of the antenna and permittivity of the walls, as amplitude factors of a wall's `reflection`."""
+    """Polarisation of the antenna and permittivity of walls; their effect multiplies a wall's `reflection`."""
 
     cross_polar_zenith_db: NotNegative = 15.0  #: Loss of left-handed relative to right-handed signals at the zenith.
     cross_polar_horizon_db: NotNegative = 4.0  #: Loss of left-handed relative to right-handed signals at the horizon.
-    wall_permittivity: float = Field(default=6.0, gt=1.0)  #: Relative permittivity, about 6 for concrete and glass.
-    #: Standard deviation of the gain over azimuth at the horizon; at other elevations, the deviation is proportional to
-    #: the cosine of the elevation. The ripples of the two antennas are independent.
+    wall_permittivity: float = Field(default=6.0, gt=1.0)  #: Relative permittivity; concrete, glass: about 6.
+    #: Standard deviation of the gain over azimuth at the horizon; at other elevations, it is proportional to the cosine
+    #: of the elevation. The ripples of the two antennas are independent.
     ripple_sigma_db: NotNegative = 0.0
 
 
 class SideStreetSettings(ScenarioSettings):
-    """Side streets with walls perpendicular to the line; pairs are ranges of uniform distributions."""
+    """Side streets with walls perpendicular to the line; a pair of numbers limits a uniform distribution."""
 
     spacing_m: Between = (50.0, 150.0)  #: Distance from the end of a street to the next street.
     width_m: Between = (8.0, 25.0)  #: Distance between the walls of a street.
@@ -149,34 +149,34 @@ class SideStreetSettings(ScenarioSettings):
     height_m: Between = (15.0, 60.0)  #: Height of the reflecting wall above the rails.
     opposite_m: Between = (5.0, 40.0)  #: Height of the opposite wall of the street above the rails.
     reflection: Between = (0.3, 1.0)  #: Amplitude reflection coefficient, as in `RowSettings`.
-    roughness_m: NotNegative = 0.01  #: Standard deviation of the surface height.
-    candidates: int = Field(default=2, ge=1, le=6)  #: Number of nearest streets that can reflect a signal.
+    roughness_m: NotNegative = 0.01  #: Standard deviation of the walls' surface height.
+    candidates: int = Field(default=2, ge=1, le=6)  #: Number of streets, nearest first, whose reflections are computed.
 
 
 class TreeSettings(ScenarioSettings):
-    """Row of trees along the line; pairs are ranges of uniform distributions."""
+    """Row of trees along the line; a pair of numbers limits a uniform distribution."""
 
     sides: Sides = "both"
     distance_m: Between = (6.0, 12.0)  #: Distance of the trunks from the track axis.
     height_m: Between = (8.0, 16.0)  #: Height of the top of a crown above the rails.
     crown_m: Between = (2.5, 4.0)  #: Height of the lower edge of a crown above the rails.
     length_m: Between = (4.0, 9.0)  #: Width of a crown.
-    gap_m: Between = (0.0, 6.0)  #: Distance to the next crown.
+    gap_m: Between = (0.0, 6.0)  #: Distance from the edge of a crown to the next crown.
     share: Share = 1.0  #: Fraction of the planting positions that have a tree.
     attenuation_db_per_m: NotNegative = 1.0  #: Specific attenuation of a crown.
     most_db: NotNegative = 12.0  #: Largest loss by a crown.
-    scatter: Share = 0.5  #: Fraction of the lost amplitude that is scattered.
+    scatter: Share = 0.5  #: Fraction of the amplitude lost in a crown that is scattered to the antenna.
 
 
 class NeighbourSettings(ScenarioSettings):
     """Vehicles on a parallel track or lane that follow each other at constant speed."""
 
     side: Literal["left", "right"] = "right"
-    lateral_m: Positive = 2.5  #: Distance of the side of the vehicles from the track axis.
+    lateral_m: Positive = 2.5  #: Distance of the near side of the vehicles from the track axis.
     height_m: Positive = 4.3  #: Height of the top of the vehicles above the rails.
     length_m: Positive = 100.0  #: Length of a vehicle.
-    spacing_m: Positive = 5000.0  #: Distance from the start of a vehicle to the start of the next.
-    speed_mps: Finite = -20.0  #: Speed, positive toward rising chainage.
+    spacing_m: Positive = 5000.0  #: Distance from the start of a vehicle to the start of the next vehicle.
+    speed_mps: Finite = -20.0  #: Speed of the vehicles, positive toward rising chainage.
     reflection: Share = 0.8  #: Amplitude reflection coefficient of the sides of the vehicles.
 
 
@@ -189,10 +189,10 @@ class RoofEquipment(ScenarioSettings):
 
 
 class EnvironmentSettings(ScenarioSettings):
-    """Structures along the line that block, reflect and scatter signals; by default none."""
+    """Structures along the line that block, reflect and scatter signals; there are none by default."""
 
     electrification: ElectrificationSettings | None = None
-    sections: tuple[SectionSettings, ...] = ()  #: Sections by rising chainage; between sections, the line is open.
+    sections: tuple[SectionSettings, ...] = ()  #: Sections in order of chainage; between sections, the line is open.
     #: Fraction of the line length by kind of section, instead of `sections`; the sections are then drawn at random.
     shares: dict[Kind, Share] = Field(default_factory=dict)
     section_length_m: Annotated[Between, at_least(20.0)] = (150.0, 800.0)  #: Range of the lengths of drawn sections.
@@ -200,14 +200,14 @@ class EnvironmentSettings(ScenarioSettings):
     ground_reflection: Share = 0.5  #: Amplitude reflection coefficient of the ballast; 0 for no reflection.
     ground_roughness_m: NotNegative = 0.05  #: Standard deviation of the height of the ballast.
     receiver: CorrelatorSettings = CorrelatorSettings()
-    #: Polarisation of antenna and walls. With None, a wall's `reflection` applies to every polarisation.
+    #: Effect of polarisation on reflections; if None, a wall's `reflection` applies to any polarisation.
     antenna: AntennaSettings | None = None
-    #: "opposite" adds signals that the nearest rows on both sides reflect in sequence.
+    #: "opposite" adds signals reflected twice, by the first rows of walls on opposite sides of the line.
     second_reflections: Literal["none", "opposite"] = "none"
     side_streets: SideStreetSettings | None = None  #: Side streets along the whole line.
     trees: tuple[TreeSettings, ...] = ()  #: Rows of trees along the whole line.
     neighbours: tuple[NeighbourSettings, ...] = ()  #: Vehicles on parallel tracks.
-    equipment: tuple[RoofEquipment, ...] = ()  #: Roof equipment, at the same distances from both antennas.
+    equipment: tuple[RoofEquipment, ...] = ()  #: Roof equipment; the same at either antenna.
 
     @field_validator("sections")
     @classmethod
@@ -261,13 +261,13 @@ class SightGeometry:
 class Disturbance:
     """Terms that are added to the observations of T epochs and M channels, shapes (T, M)."""
 
-    code_m: Floats  #: Code error; NaN where the signal is lost, so that all observables are absent.
+    code_m: Floats  #: Code error; where it is NaN, the signal is lost and has no observables.
     phase_m: Floats
     doppler_hz: Floats
     cn0_db: Floats  #: Change of C/N0, negative where the signal is attenuated.
 
 
-#: Function that computes disturbances from the geometry only, so that results do not depend on the chunks.
+#: Function that computes disturbances from the geometry only; results therefore do not depend on the chunks.
 Disturbances = Callable[[SightGeometry], Disturbance]
 
 

@@ -109,14 +109,14 @@ class Strips:
     chainage and do not overlap.
     """
 
-    start_m: Floats  #: Chainage of the start, shape (n,).
-    end_m: Floats  #: Chainage of the end, shape (n,).
-    border_m: Floats  #: Chainage from which on the structure is the nearest, plus `side * reach_m`, shape (n,).
-    reach_m: float  #: Length that is larger than all chainages.
+    start_m: Floats  #: Chainage of the start of each structure, shape (n,).
+    end_m: Floats  #: Chainage of the end of each structure, shape (n,).
+    border_m: Floats  #: Chainage from which it is the nearest, plus `reach_m` on the right side; (n,).
+    reach_m: float  #: Length larger than all chainages.
     value: dict[str, Floats]  #: Properties by name, each of shape (n,).
 
     def nearest(self, side: Indices, chainage_m: Floats) -> Indices:
-        """Return the index of the nearest structure on a side (0 left, 1 right). No side may be empty."""
+        """Return the index of the nearest structure on a side (0 left, 1 right). Both sides must have structures."""
         low = np.clip(chainage_m, -0.25 * self.reach_m, 0.5 * self.reach_m)
         return np.searchsorted(self.border_m, side * self.reach_m + low, side="right") - 1
 
@@ -130,7 +130,7 @@ class Structures:
     walls: tuple[Strips, ...]
     #: Rows of roofs with `inner_m`, `outer_m`, `height_m` and `through` (amplitude factor of signals through the roof).
     roofs: tuple[Strips, ...]
-    borders_m: Floats  #: Start and end chainages of the S sections, shape (2 S,).
+    borders_m: Floats  #: Start and end chainage of each section, shape (2 S,).
     kinds: Strings  #: Kind of section before, between and after the borders, shape (2 S + 1,).
 
 

@@ -23,7 +23,7 @@ from railfix.simulate.environment.settings import AntennaSettings, NeighbourSett
 from railfix.simulate.environment.structures import Strips
 
 FREE_V: Final = -99.0  #: Fresnel parameter of an unobstructed ray.
-#: Lower limit of direction components, which avoids division by zero for rays parallel to a wall.
+#: Smaller lateral components of rays are replaced by this, which avoids division by zero for rays parallel to a wall.
 _LEAST_LATERAL: Final = 1e-3
 
 
@@ -99,7 +99,7 @@ class Reflections:
     """Reflections of N rays by one row of walls, shapes (N,)."""
 
     amplitude: Floats  #: Amplitude of the reflection; nearly 0 where the wall is absent or too small.
-    extra_m: Floats  #: Extra path compared with the direct signal.
+    extra_m: Floats  #: Path of the reflection minus path of the direct signal.
     rate: Floats  #: Growth of the extra path with the chainage of the antenna [m/m].
     x_m: Floats  #: Coordinate x of the mirror image of the antenna, relative to the antenna.
     y_m: Floats  #: Coordinate y of the mirror image of the antenna, relative to the antenna.
@@ -165,15 +165,15 @@ def roof_amplitude(row: Strips, rays: Rays) -> Floats:
     return np.where(over, np.maximum(edge_amplitude(v), np.where(v > 0.0, row.value["through"][roof], 0.0)), 1.0)
 
 
-_LEAST_TWICE: Final = 0.05  #: Smallest lateral component of rays for which second reflections are computed.
+_LEAST_TWICE: Final = 0.05  #: Rays with a smaller lateral component have no second reflection.
 
 
 def second_reflection(
     rows: tuple[Strips, ...], rays: Rays, antenna: AntennaSettings | None
 ) -> tuple[Floats, Floats, Floats]:
-    """Return amplitude, extra path [m] and growth [m/m] of signals reflected by both sides in sequence, shapes (N,).
+    """Return amplitude, extra path [m] and growth [m/m] of signals reflected twice, on either side; shapes (N,).
 
-    The extra path is ``2 (d_A + d_B) |u_y|`` with the distances d_A and d_B of the first row's walls on the two sides.
+    The extra path is ``2 (d_A + d_B) |u_y|`` with the distances d_A and d_B of the first wall row on each side.
     """
     row = rows[0]
     side = (rays.y > 0.0).astype(np.intp)
@@ -202,7 +202,7 @@ def second_reflection(
     return np.where(seen, amplitude, 0.0), 2.0 * (near + away) * lateral, growth
 
 
-#: Lower limit of the lateral and longitudinal components of a ray's direction, for reflections by side streets.
+#: For reflections by side streets, smaller lateral and longitudinal components of rays are replaced by this.
 _LEAST_SIDE: Final = 0.02
 
 
@@ -264,8 +264,8 @@ def street_reflections(
             front, width = street.front_m[number], street.end_m[number] - street.start_m[number]
             top = street.height_m[number]
             inside = np.minimum(aside - front, front + street.depth_m[number] - aside) * along[rows]
-            # The ray must pass the mouth: there the distance of the ray from the wall must be less than the width of
-            # the street.
+            # The ray must pass through the mouth of the street: there, its distance from the wall must be less than the
+            # width.
             mouth = (width - distance * (1.0 - front / np.maximum(aside, front))) * lateral[rows]
             over = height + rays.z[rows] * width / along[rows] - street.opposite_m[number]
             margin = np.minimum(np.minimum(inside, mouth), np.minimum(top - height, over))
@@ -279,7 +279,7 @@ def street_reflections(
     return found
 
 
-_EDGE_M: Final = 0.5  #: Width of the edge of a crown over which the loss increases to its full value [m].
+_EDGE_M: Final = 0.5  #: At the edge of a crown, the loss increases from 0 to its full value over this distance [m].
 
 
 def foliage(row: Strips, rays: Rays) -> tuple[Floats, Floats, Floats]:
@@ -305,7 +305,7 @@ def foliage(row: Strips, rays: Rays) -> tuple[Floats, Floats, Floats]:
     return left, value["scatter"] * (1.0 - left), 0.5 * way * (1.0 + rays.x)
 
 
-_SIDE: Final = {"right": 1.0, "left": -1.0}  #: Sign of y on a side of the line.
+_SIDE: Final = {"right": 1.0, "left": -1.0}  #: Sign of the coordinate y on each side of the line.
 
 
 def neighbour_clearance(settings: NeighbourSettings, rays: Rays, time_s: Floats) -> Floats:
