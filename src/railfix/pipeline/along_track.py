@@ -53,7 +53,7 @@ _END_SIGMAS: Final = 4.0
 _END_M: Final = 30.0
 #: A two-way range is used if it differs from the predicted range by at most this number of standard deviations.
 _GATE_SIGMAS: Final = 3.0
-#: Two-way ranges longer than predicted by up to this are also used [m]. Echoes over 0.3 m longer are separable (P2).
+#: Two-way ranges too long by up to this are also used [m]. Echoes over 0.3 m longer are separable (P2, table 3).
 _LATE_M: Final = 0.6
 #: Vertical error of the ionospheric model that the filter's constants `slow_code_m` and `TILT_M` assume [m].
 _QUIET_IONOSPHERE_M: Final = 1.0

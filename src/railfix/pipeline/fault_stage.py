@@ -27,7 +27,7 @@ from railfix.positioning.range_arrays import Ranges
 from railfix.positioning.receiver_noise import NoiseState, noise_scale
 from railfix.ranges.corrected import CorrectedRanges
 
-#: An epoch does not affect the noise scale if its residual variance exceeds this times the assumed variance.
+#: Epochs with residual variance / assumed variance above this do not affect the noise scale: (100 sigmas)^2.
 _LARGEST_VARIANCE: Final = 1e4
 
 
