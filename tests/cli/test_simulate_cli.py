@@ -123,7 +123,7 @@ def test_exit_codes(tmp_path: Path) -> None:
         (4, ("demo", "--out", out, "--only", 1), "single run"),
         (4, ("p1-commercial", "--out", out, "--only", 9), "no such run"),
         (3, (tmp_path / "broken.toml", "--out", out), "TOML"),
-        (3, ("nothing", "--out", out), "shipped are"),
+        (3, ("nothing", "--out", out), "shipped scenario: "),
         (3, (tmp_path / "no_nav.toml", "--out", out), str(tmp_path / "none.nav")),
         (5, ("demo", "--out", out, "--set", f"sky.nav={demo_files()['nav']}", *past), "no satellite of"),
         (2, ("demo",), "--out"),

@@ -141,7 +141,7 @@ def test_messages_are_lost_and_come_back_from_their_file(simulation: Simulation,
 
 
 def test_a_value_that_does_not_fit_its_field_is_an_error() -> None:
-    with pytest.raises(ValueError, match="type 2: 4800 does not fit 12 bits"):
+    with pytest.raises(ValueError, match="type 2: 4800 does not fit into 12 bits"):
         service.fast(0, [600.0], [5])
     with pytest.raises(ValueError, match="no field brr"):
         service.parameters(0, brr=1)

@@ -183,7 +183,7 @@ def test_recipes_that_are_none_are_refused(tmp_path: Path, text: str, told: str)
 def test_files_that_are_no_scenarios(tmp_path: Path) -> None:
     with pytest.raises(InputFileError, match="not valid TOML"):
         load_scenario(write_text(tmp_path, "seed = "))
-    with pytest.raises(InputFileError, match=r"shipped are .*demo"):
+    with pytest.raises(InputFileError, match=r"shipped scenario: .*demo"):
         load_scenario("nothing")
     with pytest.raises(InputFileError, match="cannot be read"):
         load_scenario(tmp_path / "none.toml")

@@ -46,7 +46,7 @@ def navigation_of_file(scenario: Scenario, path: str) -> Navigation:
     if "G" not in navigation.klobuchar and scenario.sky.ionosphere_scale > 0.0:
         raise MismatchError(
             f"{path}: has no Klobuchar coefficients of GPS, which the simulated ionosphere needs; use another file, "
-            "or set sky.ionosphere_scale to 0 and position with `--set ionosphere=off`"
+            "or set sky.ionosphere_scale to 0 and run `railfix run` with `--set ionosphere=off`"
         )
     records = _select_simulated(navigation.kepler, scenario.sky.systems, _messages(scenario))
     first = scenario.start

@@ -36,7 +36,7 @@ def demo_folder() -> Path:
             if missing:
                 raise InputFileError(place / missing[0], "the demonstration run is incomplete; install railfix again")
             return place
-    raise InputFileError(places[0], f"the demonstration run is neither here nor in {places[1]}; install railfix again")
+    raise InputFileError(places[0], f"has no demonstration run, nor has {places[1]}; install railfix again")
 
 
 def demo_files() -> dict[str, Path]:

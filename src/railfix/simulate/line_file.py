@@ -55,10 +55,10 @@ class Element(ScenarioSettings):
         if curved != math.isfinite(self.radius_m) or (curved and abs(self.radius_m) < 30.0):
             raise ValueError(
                 f"radius_m of a {self.kind} is {self.radius_m}; a curve has a radius of at least 30 m "
-                "(negative to the left), other elements have none"
+                "(negative to the left), and only curves have a radius"
             )
         if self.cant_m > 0.0 and not curved:
-            raise ValueError(f"cant_m of a {self.kind} is {self.cant_m}; give it to the curve")
+            raise ValueError(f"cant_m of a {self.kind} is {self.cant_m}; only a curve has a cant")
         return self
 
 
@@ -99,7 +99,7 @@ class GeneratedLine(ScenarioSettings):
     def _from_the_start(cls, terrain: tuple[Terrain, ...]) -> tuple[Terrain, ...]:
         starts = [part.from_m for part in terrain]
         if not starts or starts[0] != 0.0 or any(a >= b for a, b in pairwise(starts)):
-            raise ValueError(f"must begin at 0, in rising order; the values of from_m are {starts}")
+            raise ValueError(f"from_m must begin at 0 and be in ascending order, got {starts}")
         return terrain
 
 
@@ -163,15 +163,15 @@ class LineSettings(ScenarioSettings):
         """Reject settings that belong to another kind of line, and lengths that do not fit the kind."""
         total = math.fsum(item.length_m for item in self.elements)
         if (self.kind == "elements") != bool(self.elements) or (self.gradients and not self.elements):
-            raise ValueError(f"elements and gradients belong to kind 'elements', got kind {self.kind!r}")
+            raise ValueError(f"line.elements and line.gradients require line.kind 'elements', got {self.kind!r}")
         if (self.kind == "file") != (self.file is not None):
-            raise ValueError(f"file belongs to kind 'file', got kind {self.kind!r}")
+            raise ValueError(f"line.file requires line.kind 'file', got {self.kind!r}")
         if self.kind != "generated" and self.generated != GeneratedLine():
-            raise ValueError(f"generated belongs to kind 'generated', got kind {self.kind!r}")
+            raise ValueError(f"line.generated requires line.kind 'generated', got {self.kind!r}")
         if self.length_m > LONGEST_LINE_M:
             raise ValueError(f"length_m is {self.length_m:g}, expected at most {LONGEST_LINE_M:g}")
         if self.kind == "file" and not math.isnan(self.length_m):
-            raise ValueError("length_m follows from the file; give from_m and to_m of the file to use a part")
+            raise ValueError("length_m follows from the file; to use a part, set line.file.from_m and to_m")
         if self.kind == "elements" and abs(self.length_m - total) > 1e-6:
             raise ValueError(f"length_m is {self.length_m}, but the elements are {total} m long")
         if self.kind != "file" and not self.length_m >= 100.0:
@@ -342,8 +342,8 @@ def line_of_file(settings: LineFile) -> FileLine:
     if used.sum() < 4:
         raise InputFileError(
             settings.path,
-            f"has {used.sum()} points from {settings.from_m:g} to {settings.to_m:g} m of its "
-            f"{track.chainage_m[-1]:.0f} m, expected at least 4",
+            f"has {used.sum()} points between {settings.from_m:g} and {settings.to_m:g} m; expected at least 4 (the "
+            f"file is {track.chainage_m[-1]:.0f} m long)",
         )
     track = track if used.all() else take_rows(track, used)
     chord = CubicSpline(track.chainage_m, track.ecef_m, axis=0)
@@ -355,7 +355,7 @@ def line_of_file(settings: LineFile) -> FileLine:
     if abs(curvature[worst]) > 1.0 / _TIGHTEST_M:
         raise InputFileError(
             settings.path,
-            f"bends with a radius of {1.0 / abs(curvature[worst]):.1f} m at {at[worst]:.1f} m of it, expected at least "
+            f"has a radius of {1.0 / abs(curvature[worst]):.1f} m at chainage {at[worst]:.1f} m; expected at least "
             f"{_TIGHTEST_M:g} m; remove noisy points, or give coordinates with more digits",
         )
     point = np.interp(track.chainage_m, at, arc)

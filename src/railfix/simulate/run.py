@@ -43,7 +43,7 @@ def run_readme(simulation: Simulation, files: dict[str, Path], command: str) -> 
     return f"""# A simulated run
 
 {_list_inventions(scenario)}
-It is not a recording.
+The run is not a recording.
 
 {made}
 | file | what |
@@ -53,7 +53,7 @@ It is not a recording.
 {scenario.epochs} epochs at {scenario.rate_hz:g} Hz from {scenario.start} GPS time, {len(satellites)} satellites.
 The pseudoranges include light time, Earth rotation, satellite and receiver clocks, group delays, Klobuchar's
 ionospheric delay, Saastamoinen's tropospheric delay (standard atmosphere, 70 % humidity) and white noise. A receiver
-that applies the same models corrects the delays exactly, unless a scale in the table below is not 1.
+that applies the same models corrects the delays exactly if the scales in the table below are 1.
 
 {_list_effects(scenario)}
 
@@ -80,7 +80,7 @@ def _files(simulation: Simulation, files: dict[str, Path]) -> dict[str, str]:
         "nav": "RINEX broadcast records",
         "track": f"track map, {len(simulation.line.track())} points; ellipsoidal heights{off}",
         "vehicle": "bogie distance, gauge, antennas",
-        "truth": "ground truth: chainage of the centreline point abeam each antenna, its position (ECEF), speed, "
+        "truth": "ground truth of each antenna: its ECEF position, chainage of the centreline point abeam, speed, "
         "acceleration, kind of section",
         **{
             station.name: "observations of a reference station; its position is in the header"
@@ -130,7 +130,7 @@ def _list_effects(scenario: Scenario) -> str:
             f"Give `railfix run` the balise reader's position with `--set sensors.balise.ahead_m={balises.along_m:g}`."
         )
     if scenario.multipath:
-        parts.append("Disturbances given from Python, which are not in the settings below.")
+        parts.append("Further disturbances, computed by Python functions that are not in the settings below.")
     return " ".join(parts)
 
 

@@ -53,7 +53,7 @@ def pack_message(text: str, kind: int, fields: Sequence[Field]) -> Bytes:
     """
     for value, length in fields:
         if not -(1 << length) < 2 * value + 1 <= (1 << (length + 1)):
-            raise ValueError(f"type {kind}: {value} does not fit {length} bits")
+            raise ValueError(f"type {kind}: {value} does not fit into {length} bits")
         text += f"{value & ((1 << length) - 1):0{length}b}"
     if len(text) > DATA_BITS:
         raise ValueError(f"type {kind}: {len(text)} bits, expected at most {DATA_BITS}")

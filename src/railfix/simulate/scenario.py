@@ -78,7 +78,7 @@ class RunSettings(ScenarioSettings):
     def _apart(cls, stations: tuple[Station, ...]) -> tuple[Station, ...]:
         places = [station.at_m for station in stations]
         if len(places) == 1 or any(b - a < 10.0 for a, b in pairwise(places)):
-            raise ValueError(f"must be at least two, in rising order and at least 10 m apart; they are at {places}")
+            raise ValueError(f"must be two or more, in ascending order and at least 10 m apart, got {places}")
         return stations
 
 
@@ -128,7 +128,7 @@ class SkySettings(ScenarioSettings):
     @classmethod
     def _letters(cls, systems: str) -> str:
         if not systems or set(systems) - set(SYSTEMS) or len(set(systems)) < len(systems):
-            raise ValueError(f"must be letters of {SYSTEMS!r}, each at most once")
+            raise ValueError(f"must have letters of {SYSTEMS!r} only, each at most once")
         return systems
 
     @model_validator(mode="after")
@@ -215,7 +215,7 @@ class Scenario(ScenarioSettings):
     def _distinct_names(cls, stations: tuple[ReferenceStation, ...]) -> tuple[ReferenceStation, ...]:
         names = [*_FILES, *(station.name for station in stations)]
         if len(set(names)) < len(names):
-            raise ValueError(f"must have different names, other than {', '.join(_FILES)}")
+            raise ValueError(f"must have different names, and none of {', '.join(_FILES)}")
         return stations
 
     @model_validator(mode="after")
@@ -227,7 +227,7 @@ class Scenario(ScenarioSettings):
     @model_validator(mode="after")
     def _whole_epochs(self) -> Scenario:
         if abs(1e7 / self.rate_hz - round(1e7 / self.rate_hz)) > 1e-6:
-            raise ValueError(f"rate_hz must give an interval of whole 100 ns, got {self.rate_hz}")
+            raise ValueError(f"1 / rate_hz must be a multiple of 100 ns, got rate_hz {self.rate_hz}")
         if self.epochs < 1:
             raise ValueError("duration_s times rate_hz is less than one epoch")
         if not np.isnan(self.line.length_m) and (problem := self._room_problem(self.line.length_m)):
@@ -245,8 +245,8 @@ class Scenario(ScenarioSettings):
         reach = max(abs(v) for v in (self.vehicle.front[0], self.vehicle.rear[0], self.vehicle.bogie_distance_m / 2.0))
         if length_m <= 2.0 * margin or margin < reach + 1.0:
             return (
-                f"run.end_margin_m is {margin} m; expected at least {reach + 1.0:g} m, because the vehicle extends "
-                f"{reach:g} m from its middle, and less than half of the line, which is {length_m:g} m long"
+                f"run.end_margin_m is {margin} m; expected at least {reach + 1.0:g} m (the vehicle extends {reach:g} m "
+                f"from its middle) and less than half of the line length of {length_m:g} m"
             )
         outside = [item.at_m for item in stations if not margin <= item.at_m <= length_m - margin]
         if outside:

@@ -99,7 +99,7 @@ def find_scenario(name: FilePath) -> Path:
         return path
     if str(name) not in shipped:
         raise InputFileError(
-            name, f"is neither a scenario file nor the name of a shipped scenario; shipped are {', '.join(shipped)}"
+            name, f"is neither a scenario file nor the name of a shipped scenario: {', '.join(shipped)}"
         )
     return shipped[str(name)]
 
@@ -118,10 +118,10 @@ def load_recipe(name: FilePath) -> Recipe:
         return Recipe(path=path, description=description, names=("",), tables=(_absolute(table, path),))
     unknown = sorted(set(table) - {"base", "runs", "parts"})
     if unknown:
-        raise SettingsError(f"{path}: unknown key {unknown[0]} in a recipe; known are description, base, parts, runs")
+        raise SettingsError(f"{path}: unknown key {unknown[0]} in a recipe; expected description, base, parts, runs")
     runs = table.get("runs")
     if not isinstance(runs, list) or not runs or not all(isinstance(run, dict) for run in runs):
-        raise SettingsError(f"{path}: a recipe lists its runs as [[runs]], each with a name and its differences")
+        raise SettingsError(f"{path}: a recipe lists its runs as [[runs]], each with a name and its own settings")
     base: Mapping[str, Any] = {}
     if "base" in table:
         beside = path.parent / str(table["base"])
@@ -135,8 +135,8 @@ def load_recipe(name: FilePath) -> Recipe:
     for name_of in names:
         if not isinstance(name_of, str) or not re.fullmatch(r"[\w.-]*\w", name_of) or names.count(name_of) > 1:
             raise SettingsError(
-                f"{path}: each of [[runs]] needs a unique name (letters, digits, -, _ and dots inside) for its folder, "
-                f"got {name_of!r}"
+                f"{path}: each of [[runs]] needs a unique name, which names its folder (letters, digits, - and _, "
+                f"and dots except at the end), got {name_of!r}"
             )
     tables = tuple(_run_table(base, run, table.get("parts", {}), path) for run in runs)
     return Recipe(path=path, description=description, names=tuple(names), tables=tables)

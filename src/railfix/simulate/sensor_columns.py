@@ -186,8 +186,8 @@ COLUMNS: Final[dict[str, dict[str, str]]] = {
     "wheel_slips": {
         "time_gpst": "ground truth: start of the slip or slide, GPS time",
         "end_gpst": "ground truth: end of the slip or slide, GPS time",
-        "ratio": "ground truth: largest (wheel speed - train speed) / train speed, in the middle of the interval; "
-        "negative for a slide",
+        "ratio": "ground truth: (wheel speed - train speed) / train speed in the middle of the interval, where its "
+        "magnitude is largest; negative for a slide",
     },
     "inertial": {
         "time_gpst": "instant of the sample, GPS time",

@@ -53,7 +53,7 @@ def at_least(least: float) -> AfterValidator:
 
     def check(pair: tuple[float, float]) -> tuple[float, float]:
         if pair[0] < least:
-            raise ValueError(f"must begin at {least:g} m or more")
+            raise ValueError(f"the smaller number must be at least {least:g} m")
         return pair
 
     return AfterValidator(check)
@@ -257,7 +257,7 @@ class TachometerSettings(ScenarioSettings):
     def _in_order(cls, slips: tuple[SlipInterval, ...]) -> tuple[SlipInterval, ...]:
         for before, after in pairwise(slips):
             if after.start_s < before.end_s:
-                raise ValueError(f"must not overlap; a slip from {after.start_s} s follows a slip to {before.end_s} s")
+                raise ValueError(f"must not overlap: slip from {after.start_s} s, previous slip to {before.end_s} s")
         return slips
 
     @model_validator(mode="after")

@@ -215,7 +215,7 @@ class EnvironmentSettings(ScenarioSettings):
         for before, after in pairwise(sections):
             if after.from_m < before.to_m:
                 raise ValueError(
-                    f"must rise without overlap: {after.kind} from {after.from_m:g} m "
+                    f"must be in ascending order without overlap: {after.kind} from {after.from_m:g} m "
                     f"begins before {before.kind} ends at {before.to_m:g} m"
                 )
         return sections
