@@ -98,7 +98,7 @@ def saastamoinen_delay_m(
 
 @dataclass(frozen=True, kw_only=True)
 class SeenFrom:
-    """Satellite directions at T epochs for K channels; receiver positions need be known to hundreds of metres only."""
+    """Satellite directions at T epochs for K channels; receiver positions accurate to hundreds of metres suffice."""
 
     receiver_ecef_m: Floats  #: Position of the receiver, shape (T, 3).
     latitude_deg: Floats  #: Geodetic latitude of the receiver, shape (T,).
@@ -131,7 +131,7 @@ class Delays:
     #: Delays at the carrier frequency, shape (T, K); 0 if the model of the delay is off, NaN where SBAS has no delay.
     ionosphere_m: Floats
     troposphere_m: Floats
-    #: Sigma without receiver noise, (T, K); 0 if the Klobuchar coefficients were received, NaN where unknown.
+    #: Sigma added to receiver noise in quadrature, (T, K); 0 for received Klobuchar coefficients, NaN if unknown.
     sigma_m: Floats
     reason: Bits  #: Rejection reasons (`Reason` bits) where a delay is unknown, shape (T, K).
 

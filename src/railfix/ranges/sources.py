@@ -105,7 +105,7 @@ class BroadcastSource:
     #: Additional sigma of the vertical delay if typical coefficients are used; 0 if the coefficients were received.
     ionosphere_sigma_m: float = 0.0
     troposphere: Literal["saastamoinen", "off"] = "saastamoinen"
-    nominal: NominalErrors = field(default_factory=NominalErrors)  #: Assumed nominal errors.
+    nominal: NominalErrors = field(default_factory=NominalErrors)  #: Assumed satellite and atmospheric error sigmas.
     notes: tuple[str, ...] = ()  #: Notes on requested data that had to be replaced.
     second: Literal["none", "optional", "required"] = "optional"
 

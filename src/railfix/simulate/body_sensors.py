@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 #: Time step [s]; within a step, the wheel's acceleration is assumed to be constant.
 _STEP_S: Final = 0.01
 _LOOK_S: Final = 0.1  #: Time step of the search for phases of acceleration and braking [s].
-_HARD_MPS2: Final = 0.05  #: Phases with less acceleration are ignored [m/s^2].
+_HARD_MPS2: Final = 0.05  #: Phases with less acceleration or deceleration than this are ignored [m/s^2].
 #: Seeds of random streams: phase and jitter, slips, tooth errors, lost and doubled pulses.
 _WHEEL, _SLIPS, _TEETH, _MISCOUNT = 20, 21, 30, 31
 

@@ -111,7 +111,7 @@ def _list_effects(scenario: Scenario) -> str:
     ]
     if scenario.sbas is not None:
         what = (
-            "GPS and the ionosphere" if scenario.sbas.band == "L1" else "ionosphere-free codes of GPS and Galileo (L5)"
+            "GPS and the ionosphere" if scenario.sbas.band == "L1" else "codes of GPS, Galileo and BeiDou on L1 and L5"
         )
         parts.append(f"SBAS messages that correct {what}.")
     if scenario.vehicle.sway_sigma_deg:

@@ -294,7 +294,7 @@ class InertialSettings(ScenarioSettings):
     #: Standard deviation of the vibration on each accelerometer axis at 20 m/s and more; at lower speeds, it is
     #: proportional to the speed.
     vibration_sigma_mps2: NotNegative = 0.0
-    vibration_sigma_radps: NotNegative = 0.0  #: As `vibration_sigma_mps2`, on each gyroscope axis.
+    vibration_sigma_radps: NotNegative = 0.0  #: Vibration sigma of each gyroscope axis at 20 m/s or more, else lower.
     #: Mean frequency of the vibration, with a relative bandwidth of 15 %. Frequencies above half of `rate_hz` are
     #: aliased.
     vibration_hz: Positive = 12.0
@@ -320,7 +320,7 @@ class RadarSettings(ScenarioSettings):
     highest_mps: Positive = 200.0 / 3.6  #: Higher speeds are not measured.
 
     dropouts: tuple[Dropout, ...] = ()  #: Specified dropouts.
-    dropouts_per_hour: NotNegative = 0.0  #: Mean number of random dropouts; times between them are exponential.
+    dropouts_per_hour: NotNegative = 0.0  #: Mean number of random dropouts; the time between them is exponential.
     dropout_duration_s: Positive = 5.0  #: Mean of the exponentially distributed durations of random dropouts.
 
 
@@ -376,7 +376,7 @@ class BaliseSettings(ScenarioSettings):
     along_m: Finite = 0.0  #: Position of the reader in the body along the forward axis, as for the antennas.
     noise_sigma_m: NotNegative = 0.0  #: Standard deviation of the position error of a reading along the line.
     missed: tuple[str, ...] = ()  #: Names of balises that are not read.
-    wrong: dict[str, str] = Field(default_factory=dict)  #: Identities read instead of a balise's name, by name.
+    wrong: dict[str, str] = Field(default_factory=dict)  #: For a balise name, the wrong identity that is read.
     missed_chance: Share = 0.0  #: Probability that a balise is never read.
     wrong_chance: Share = 0.0  #: Probability that a balise is always read with the identity of another balise.
 

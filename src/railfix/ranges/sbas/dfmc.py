@@ -43,7 +43,7 @@ from railfix.ranges.sbas.standard import first_that_holds, system_name
 
 AUGMENTED: Final = 92  #: Largest number of satellites in a mask.
 FIRST: Final = 53  #: Number of satellites with indicators in type 35; type 36 has the rest.
-DO_NOT_USE: Final = 15  #: Indicator for "do not use"; type 32 has no satellites that are not monitored.
+DO_NOT_USE: Final = 15  #: Indicator for "do not use"; unmonitored satellites are absent from type 32.
 #: Sigma [m] for each indicator from 0 to 14 if the scale of type 37 is 0.
 SIGMA_LEAST_M: Final = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 1.0, 1.25, 1.5, 1.75, 2.0, 2.5, 3.0, 4.0, 10.0)
 #: For each indicator from 0 to 14, this step [m], multiplied by the scale of type 37, is added to `SIGMA_LEAST_M`.
@@ -364,7 +364,7 @@ _ORBIT_LAYOUTS: Final[Mapping[int, Layout]] = {
         "time_of_day_s": BitField(100, 6, 1800.0),
     },
 }
-_ALMANACS_AT: Final = (10, 116)  #: Message type 47 has two satellites; first bit of each.
+_ALMANACS_AT: Final = (10, 116)  #: First bit of each of the two satellites in a message of type 47.
 
 
 @dataclass(frozen=True, kw_only=True)

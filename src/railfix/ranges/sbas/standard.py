@@ -135,7 +135,7 @@ class SatelliteCorrections(FrozenArrays):
     record: Integers  #: Row of `navigation.kepler` with this issue, -1 without navigation data; shape (T, K).
     udrei: Integers  #: UDREI, -1 where none was received; shape (T, K).
     sigma_udre_m: Floats  #: Sigma of the fast and long-term corrections without degradation, shape (T, K).
-    #: Degradation terms (DO-229D, A.4.5.1), shape (T, K). Where `inflated`, the first is 8 m, the others 0.
+    #: Degradation terms (DO-229D, A.4.5.1), shape (T, K). Where `inflated`, `fast_growth_m` is 8 m, other terms are 0.
     fast_growth_m: Floats
     rate_growth_m: Floats
     long_term_growth_m: Floats

@@ -133,7 +133,7 @@ class AntennaSettings(ScenarioSettings):
 
     cross_polar_zenith_db: NotNegative = 15.0  #: Loss of left-handed relative to right-handed signals at the zenith.
     cross_polar_horizon_db: NotNegative = 4.0  #: Loss of left-handed relative to right-handed signals at the horizon.
-    wall_permittivity: float = Field(default=6.0, gt=1.0)  #: Relative permittivity; concrete, glass: about 6.
+    wall_permittivity: float = Field(default=6.0, gt=1.0)  #: Relative permittivity, about 6 for concrete and glass.
     #: Standard deviation of the gain over azimuth at the horizon; at other elevations, it is proportional to the cosine
     #: of the elevation. The ripples of the two antennas are independent.
     ripple_sigma_db: NotNegative = 0.0
@@ -207,7 +207,7 @@ class EnvironmentSettings(ScenarioSettings):
     side_streets: SideStreetSettings | None = None  #: Side streets along the whole line.
     trees: tuple[TreeSettings, ...] = ()  #: Rows of trees along the whole line.
     neighbours: tuple[NeighbourSettings, ...] = ()  #: Vehicles on parallel tracks.
-    equipment: tuple[RoofEquipment, ...] = ()  #: Roof equipment; the same at either antenna.
+    equipment: tuple[RoofEquipment, ...] = ()  #: Roof equipment; its position relative to each antenna is the same.
 
     @field_validator("sections")
     @classmethod

@@ -105,13 +105,12 @@ SIDES: Final = ("left", "right")  #: Sides of the line, in the order of the arra
 
 @dataclass(frozen=True, kw_only=True)
 class Strips:
-    """Structures on the left side, then on the right side, n in total. The structures of a side are in order of
-    chainage and do not overlap.
-    """
+    """Structures of the left, then of the right side, n in total; each side in order of chainage, without overlap."""
 
     start_m: Floats  #: Chainage of the start of each structure, shape (n,).
     end_m: Floats  #: Chainage of the end of each structure, shape (n,).
-    border_m: Floats  #: Chainage from which it is the nearest, plus `reach_m` on the right side; (n,).
+    #: Chainage from which on the structure is the nearest of its side, plus `reach_m` on the right side, shape (n,).
+    border_m: Floats
     reach_m: float  #: Length larger than all chainages.
     value: dict[str, Floats]  #: Properties by name, each of shape (n,).
 
