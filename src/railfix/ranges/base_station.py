@@ -20,9 +20,9 @@ from railfix.ranges.sources import BaseDifferences, CorrectionSource, SourceDela
 Values = TypeVar("Values", Floats, Integers)
 #: A station epoch may be up to this time [s] later than the train's epoch, because the two receiver clocks differ.
 _SAME_S: Final = 0.05
-#: Code errors of the station older than this are not used [s]. They change by centimetres in 30 s.
+#: Older station code errors are not used [s]. Without selective availability, they change by centimetres in 30 s.
 LONGEST_AGE_S: Final = 60.0
-#: Phase errors of the station older than this are not used [s]. They change by millimetres in a second.
+#: Older station phase errors are not used [s]. They change by millimetres in a second.
 _PHASE_AGE_S: Final = 1.1
 #: Part of the sigma of corrected ranges that is proportional to the distance between station and train [m/km]; it
 #: covers differences of ionospheric, tropospheric and orbit errors.
@@ -33,7 +33,7 @@ LONGEST_KM: Final = 100.0  #: Ranges are not corrected if the train is farther t
 class BaseLimits(Settings):
     """Settings of the corrections by a base station."""
 
-    #: Standard deviation of the corrections due to smoothed multipath of the station; without noise of the train [m].
+    #: Standard deviation of the corrections due to the station's smoothed multipath [m]; the train's noise is added.
     sigma_m: float = Field(default=0.3, gt=0)
     #: Random walk of an ambiguity [m/sqrt(s)]; with a base station, it replaces `PhaseLimits.drift_m`.
     drift_m: float = Field(default=0.001, ge=0)

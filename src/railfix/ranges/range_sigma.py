@@ -22,8 +22,8 @@ class CodeNoise(Settings):
     """
 
     model: Literal["cn0_elevation", "elevation"] = "cn0_elevation"  #: "elevation" omits the C/N0 factor.
-    #: Standard deviation of a satellite at the zenith with 45 dB-Hz, without the floor. Only ratios of sigmas affect
-    #: the position, because the noise scale of the receiver is estimated from residuals (`pipeline.AntennaState`).
+    #: Standard deviation of codes of a satellite at the zenith with 45 dB-Hz, without the floor. Only ratios of sigmas
+    #: affect the position, because the receiver's noise scale is estimated from residuals (`pipeline.AntennaState`).
     zenith_sigma_m: float = Field(default=1.0, gt=0)
     #: Error floor: sigma of residual errors of satellite clock and orbit, ionosphere and troposphere.
     floor_sigma_m: float = Field(default=1.0, ge=0)
@@ -62,7 +62,7 @@ class NominalErrors(Settings):
     #: independent.
     ionosphere_sigma_m: float = Field(default=1.0, ge=0)
     #: Minimum ionospheric sigma as a fraction of the modelled slant delay; DO-229D J.2.3 uses one fifth. If this
-    #: fraction of the vertical delay exceeds 1 m, the sigma of the filter and protection level also increase. They do
+    #: fraction of the vertical delay exceeds 1 m, the filter's sigma and the protection level also increase. They do
     #: not increase if SBAS or a base station corrects the ionosphere. 0 disables the minimum.
     ionosphere_share: float = Field(default=0.2, ge=0)
     #: Additional sigma of the vertical delay if typical Klobuchar coefficients are used because none were received.

@@ -33,7 +33,7 @@ _SEMI_MAJOR_M: Final = 6_378_137.0
 _FLATTENING: Final = 1.0 / 298.257_223_563
 #: Spacing of the points at which the line is integrated [m]; the spline between the points is accurate to 1e-6 m.
 _STEP_M: Final = 0.5
-#: Number of rounds of the integration; each round reduces the error by a factor of (line length / Earth radius).
+#: Number of rounds of the integration; each round multiplies the error by (line length / Earth radius).
 _ROUNDS: Final = 8
 
 #: Elements of the simulated test line: length [m]; radius at the end of the element (right positive) [m]; cant at the

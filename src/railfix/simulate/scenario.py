@@ -165,7 +165,7 @@ class ReceiverSettings(ScenarioSettings):
     #: Clock bias of the front receiver at the start; biases of other receivers with separate clocks are fixed
     #: multiples.
     clock_bias_s: float = Field(default=1.2e-4, gt=-0.01, lt=0.01)
-    #: Clock drift of the front receiver [s/s], multiplied for other receivers by the factors of the bias.
+    #: Clock drift of the front receiver [s/s]; for other receivers it is multiplied by the same factors as the bias.
     clock_drift: Finite = 2.0e-7
     #: With "millisecond", the receivers step their clocks by whole milliseconds, so that the bias stays within 0.5 ms.
     clock_steps: Literal["none", "millisecond"] = "none"

@@ -13,7 +13,7 @@ shows that the slot number has 8 bits and `rate_share` 4 bits, as in cssrlib, an
 the IODE of B-CNAV1. BDSBAS corrects the clocks of BeiDou-3 by decimetres. Group delays differ by metres; these
 corrections can therefore not include group delays.
 
-The orbits of SBAS satellites (ephemerides in types 39 and 40, almanacs in type 47) are used only for a note in the log.
+The orbits of SBAS satellites (ephemerides in types 39 and 40, almanacs in type 47) are used only for a note of the run.
 Layouts and scales of these messages are the same in cssrlib and MAAST (L5_decodeMT39.m, 40, 47). SouthPAN messages of
 three days (`test_sbas_orbits.py`) determine two other conventions: the semi-major axis is counted from 6370 km, and the
 node from the meridian of Greenwich at midnight of GPS time. It is not known whether a step of the inclination rate is

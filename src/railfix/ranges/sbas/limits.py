@@ -28,7 +28,7 @@ class SbasLimits(Settings):
 
     #: Time-outs for precision approach (shorter), or for the phases from en route to non-precision approach.
     mode: Literal["precision", "en_route"] = "precision"
-    type0: Literal["stop", "as_type2"] = "stop"  #: After type 0, the GEO is not used for 60 s ("stop").
+    type0: Literal["stop", "as_type2"] = "stop"  #: Type 0 stops the use of the GEO for 60 s, or is read as type 2.
     range_rate: Literal["mops", "off"] = "mops"  #: "off" omits range rates (DO-229D, A.4.4.3).
     #: Satellites without degradation data are rejected, or used with the shortest time-out and a sigma increased by 8 m
     #: (DO-229D, J.2.2).

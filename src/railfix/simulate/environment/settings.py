@@ -55,7 +55,7 @@ class ElectrificationSettings(ScenarioSettings):
     height_m: Positive = 9.0  #: Height of the top of a mast above the rails.
     beam_every: int = Field(default=1, ge=0)  #: Beams are at every mast (1), every second mast (2) ...; 0 for none.
     beam_height_m: Positive = 7.5  #: Height of the middle of a beam above the rails.
-    beam_depth_m: Positive = 0.4  #: Depth of a beam, from its lower to its upper edge.
+    beam_depth_m: Positive = 0.4  #: Depth of a beam.
     wire_height_m: Positive = 5.1  #: Height of the contact wire above the rails, over the track axis.
     wire_width_m: Positive = 0.012  #: Width of the contact wire and of the messenger wire.
     messenger_height_m: Positive = 6.0  #: Height of the messenger wire above the rails.

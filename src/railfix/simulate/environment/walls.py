@@ -265,7 +265,7 @@ def street_reflections(
             top = street.height_m[number]
             inside = np.minimum(aside - front, front + street.depth_m[number] - aside) * along[rows]
             # The ray must pass through the mouth of the street: there, its distance from the wall must be less than the
-            # width.
+            # street's width.
             mouth = (width - distance * (1.0 - front / np.maximum(aside, front))) * lateral[rows]
             over = height + rays.z[rows] * width / along[rows] - street.opposite_m[number]
             margin = np.minimum(np.minimum(inside, mouth), np.minimum(top - height, over))
