@@ -186,7 +186,7 @@ def corrected_ranges(
     Returns
     -------
     CorrectedRanges
-        Codes that cannot be used have a rejection reason; their values are kept, and NaN where a correction is missing.
+        Codes that cannot be used have a rejection reason; their values are kept, but NaN if a correction is missing.
 
     Raises
     ------

@@ -53,7 +53,7 @@ class ErrorModelFit(Settings):
     #: Number of independent blocks below which a bin uses the samples of a wider set of bins. The largest of 30 normal
     #: errors is about two standard deviations from the mean, so that 30 blocks include the beginning of the tail.
     least_blocks: int = option(
-        "Number of blocks (30 s of one satellite) below which a bin uses a wider bin's samples.", 30, metavar="N", ge=1
+        "Bins with fewer blocks (30 s of one satellite) use samples of more bins.", 30, metavar="N", ge=1
     )
     #: Length of the blocks into which a satellite's samples are divided [s]. Errors are correlated over tens of seconds
     #: while a train is at rest.

@@ -215,7 +215,7 @@ class Scenario(ScenarioSettings):
     def _distinct_names(cls, stations: tuple[ReferenceStation, ...]) -> tuple[ReferenceStation, ...]:
         names = [*_FILES, *(station.name for station in stations)]
         if len(set(names)) < len(names):
-            raise ValueError(f"must have different names, and none of {', '.join(_FILES)}")
+            raise ValueError(f"must have names that differ from each other and from {', '.join(_FILES)}")
         return stations
 
     @model_validator(mode="after")

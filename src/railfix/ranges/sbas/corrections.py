@@ -103,10 +103,9 @@ class SbasCorrections:
     def _settings_note(self) -> str:
         limits = self.limits
         return (
-            f"SBAS corrections of {system_name(self.prn)} PRN {self.prn}: time-outs of "
-            f"{limits.mode.replace('_', ' ')}, UDREI up to {limits.largest_udrei}, type 0 "
-            f"{limits.type0.replace('_', ' ')}, range rate {limits.range_rate}, incomplete degradation data "
-            f"{limits.incomplete}"
+            f"SBAS corrections of {system_name(self.prn)} PRN {self.prn}: mode {limits.mode.replace('_', ' ')}, "
+            f"UDREI up to {limits.largest_udrei}, messages of type 0: {limits.type0.replace('_', ' ')}, range rates: "
+            f"{limits.range_rate}, satellites without degradation data: {limits.incomplete}"
         )
 
     def _leave_out(self, messages: SbasMessages) -> list[str]:
