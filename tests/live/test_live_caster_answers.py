@@ -111,9 +111,9 @@ def test_a_session_with_such_a_caster_ends_by_sigterm() -> None:
 
     def caster() -> None:
         while True:
-            connection, _ = server.accept()
-            connection.recv(4000)
-            connection.sendall(OK + b"Transfer-Encoding: chunked\r\n\r\n1\r\n \r\n-5\r\n" + bytes(300))
+            with server.accept()[0] as connection:
+                connection.recv(4000)
+                connection.sendall(OK + b"Transfer-Encoding: chunked\r\n\r\n1\r\n \r\n-5\r\n" + bytes(300))
 
     threading.Thread(target=caster, daemon=True).start()
     files = demo_files()
