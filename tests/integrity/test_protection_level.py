@@ -285,7 +285,7 @@ def test_refusals():
     with pytest.raises(ValueError, match="must not be negative"):
         protection_level(model, list("GGGGG"), n_excluded=-1)
     space = point_model(raim_cases.made(ARC, "GGGGG", seed=5), raim_cases.LINE.at_arc(ARC))
-    with pytest.raises(ValueError, match="a model on the line"):
+    with pytest.raises(ValueError, match="a model of positions on the line"):
         protection_level(space, list("GGGGG"))
 
 

@@ -211,7 +211,7 @@ def test_broken_and_foreign_messages_are_counted_and_left_out(tmp_path: Path) ->
     }  # fmt: skip
     assert at(DfmcService(read, prn=137), 4.0).state[0, 0] == DfmcState.NO_MASK
     assert not read.notes
-    with pytest.raises(InputFileError, match=r"type is 31, the type in the message on L1 is \d+ \(setting sbas_band\)"):
+    with pytest.raises(InputFileError, match=r"type is 31, but the message on L1 has type \d+ \(setting sbas_band\)"):
         read_sbas(tmp_path / "l5.sbs")
 
 
