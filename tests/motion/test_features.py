@@ -89,11 +89,8 @@ def test_the_gap_to_the_last_feature_agrees_within_three_sigmas(earlier_m: float
     allowed = 3.0 * np.sqrt(free.sigma_m**2 + earlier_m**2 + (2e-3 * way_m) ** 2)
     last = (free.arc_m - way_m - share * allowed, earlier_m, way_m)
     found = _locate(line, POINTS[2], POINTS[2], 5, last=last)
-    assert (found.verdict, found.reason) == (
-        ("accepted", "")
-        if abs(share) < 1.0
-        else ("none", "distance from the last feature disagrees with the wheel distance")
-    )
+    refused = ("none", "distance from the last feature disagrees with the wheel distance")
+    assert (found.verdict, found.reason) == (("accepted", "") if abs(share) < 1.0 else refused)
 
 
 @pytest.mark.requirement("E3")

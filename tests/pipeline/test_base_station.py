@@ -159,7 +159,7 @@ def with_place(obs: Observations, place: np.ndarray) -> Observations:
 
 
 def test_integers_without_a_base_station_and_two_kinds_of_corrections_are_refused(line_trajectory: Trajectory) -> None:
-    with pytest.raises(SettingsError, match="require a base station"):
+    with pytest.raises(SettingsError, match="requires a base station"):
         EpochProcessor(parse_config({"carrier": "fixed"}), {"front": line_trajectory})
     with pytest.raises(SettingsError, match="use only one of the two"):
         EpochProcessor(

@@ -32,7 +32,7 @@ def test_reference_is_up_to_date() -> None:
     for path, text in pages().items():
         assert path.read_text(encoding="utf-8") == text, "run python tests/studies/reference_document.py"
     settings = pages()[ROOT / "docs" / "settings.md"]  # whole descriptions, beyond a colon or the first sentence
-    for words in ("until the probability is measured on the line", "kept, with the status of the check, or dropped"):
+    for words in ("until the probability is measured on the line", '"drop" also removes the coordinates'):
         assert words in settings
 
 

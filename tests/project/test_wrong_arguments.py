@@ -53,8 +53,8 @@ WRONG: dict[str, tuple[Callable[..., object], str]] = {
         for value in (None, 3)
     },
     "no file": (lambda _: railfix.read_track([]), "no file was given"),
-    "no trajectory": (lambda m: railfix.EpochProcessor(m["config"], {}), "one for each antenna, and at least one"),
-    "path alone": (lambda m: railfix.EpochProcessor(m["config"], m["path"]), "one for each antenna, and at least one"),
+    "no trajectory": (lambda m: railfix.EpochProcessor(m["config"], {}), "pass one or more by name of the antenna"),
+    "path alone": (lambda m: railfix.EpochProcessor(m["config"], m["path"]), "pass one or more by name of the antenna"),
     "another antenna": (lambda m: railfix.EpochProcessor(m["config"], {"middle": m["path"]}), "front and rear"),
     "a track": (lambda m: railfix.EpochProcessor(m["config"], {"front": m["track"]}), "; antenna_trajectory returns"),
     "a dictionary": (lambda m: railfix.EpochProcessor({}, {"front": m["path"]}), "config: expected Config, got dict"),
