@@ -109,7 +109,7 @@ def test_an_empty_file_is_the_default(tmp_path: Path) -> None:
         ("[line]\nlenght_m = 9.0", "unknown setting line.lenght_m; known are .*, length_m,"),
         ("seed = 1.5", "seed: Input should be a valid integer, .* got 1.5"),
         ('duration_s = "long"', "duration_s: .*number"),
-        ("rate_hz = 3", "whole 100 ns"),
+        ("rate_hz = 3", "multiple of 100 ns"),
         ("start = 2024-03-05T03:10:00Z", "GPS time without a zone"),
         ('start = "yesterday"', "start: must be a time"),
         ("start = 5", "start: must be a time"),
