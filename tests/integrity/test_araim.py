@@ -230,7 +230,7 @@ def test_a_message_states_satellites_and_says_what_is_wrong_with_it(tmp_path: Pa
     path.write_text(MESSAGE.replace("bias_m = 0.75", "bias_m = -1"), encoding="utf-8")
     with pytest.raises(SettingsError, match=r"constellation\.G\.bias_m"):
         read_integrity_support(path)
-    with pytest.raises(SettingsError, match="use only one of the two"):
+    with pytest.raises(SettingsError, match="use only one of them"):
         parse_config({"integrity_support": str(path), "sbas": "stream"})
 
 
