@@ -140,7 +140,7 @@ def test_inputs_of_a_run_and_two_outputs_of_one_name_are_left(good: Desk, desk: 
     out = desk.folder / "one.rnx"
     code, output = call(desk, "convert {desk}/front.obs --out {out} --nav-out {out}", out, "--overwrite")
     assert (code, contents(desk.folder)) == (8, before), output
-    assert "is given by --out and by --nav-out" in " ".join(output.split())
+    assert "is given by both --out and --nav-out" in " ".join(output.split())
     words = "live --front {desk}/front.obs --nav {desk}/brdc.nav --track {desk}/line.csv --log {out}"
     code, output = call(desk, words, desk.folder / "truth.csv")
     assert (code, contents(desk.folder)) == (8, before), output

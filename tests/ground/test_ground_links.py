@@ -254,7 +254,7 @@ def test_keys_are_readable_by_their_owner_and_never_replaced(keys: Path) -> None
     }  # fmt: skip
     assert all((keys / name).stat().st_mode & 0o077 == 0 for name in ("train-7.key", "authority.key"))
     before = {path.name: path.read_bytes() for path in keys.iterdir()}
-    with pytest.raises(OutputError, match="every certificate exists already"):
+    with pytest.raises(OutputError, match="all certificates already exist"):
         write_keys(keys, [7])
     assert [path.name for path in write_keys(keys, [7, 9])] == ["train-9.pem", "train-9.key"]
     assert {path.name: path.read_bytes() for path in keys.iterdir()}.items() > before.items()

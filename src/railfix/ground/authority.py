@@ -35,7 +35,8 @@ class Authority(Message):
     end_cm: Chainage  #: Chainage where the authority ends.
     direction: Literal[-1, 1]
     stopped: bool  #: Whether the train is ordered to stop.
-    #: Whether the train is requested to shorten its earlier authority to `end_cm`, if it can stop before `end_cm`.
+    #: Whether this is a request to shorten the earlier authority to `end_cm`. The train complies if it can stop before
+    #: `end_cm`.
     shortens: bool = False
     #: Identifier of the session in which `report` was sent. The on-board unit draws a new identifier at each start.
     session: Annotated[int, Field(ge=0, lt=1 << 62)] = 0

@@ -1,4 +1,4 @@
-"""State and displayed position of each train in the control centre; the display is not a safety function.
+"""State and displayed position of each train, as the control centre records them; the display is not a safety function.
 
 A pure state machine (P5 3.1): `report_received` and `time_passed` take the record of a train and return the new record.
 The displayed position is indicative only; a train occupies the interval from its last safe rear end to the end of the

@@ -131,7 +131,7 @@ class OrderDesk:
         return None
 
     def change(self, values: Values, *, of: str) -> tuple[Interlocking, str | None]:
-        """Carry out the change named `of`; return the new state, and the reason if the change is refused."""
+        """Carry out a change, whose name is `of`. Return the new state and, if the change is refused, the reason."""
         state, layout = self.supervision.state, self.supervision.layout
         train = number_of(values, "train")
         if isinstance(train, str):

@@ -117,7 +117,7 @@ def write_keys(folder: Path, trains: Iterable[int], *, valid_days: int = VALID_D
         signing, issuer = _read_authority(folder)
         names = [name for name in names if not (folder / f"{name}.pem").exists()]
         if not names:
-            raise OutputError(f"{folder}: every certificate exists already; --renew makes new certificates")
+            raise OutputError(f"{folder}: all certificates already exist; --renew makes new certificates")
         parts: dict[str, bytes] = {}
     else:
         signing = ec.generate_private_key(ec.SECP256R1())

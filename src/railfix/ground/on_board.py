@@ -287,7 +287,7 @@ class OnBoard:
         return f"{motion.speed_mps:.1f} m/s exceeds {found.intervention_mps:.1f} m/s, the limit for {target}{overruns}"
 
     def turn(self, direction: int, front_m: float) -> None:
-        """Change ends to a new running direction; the train then has no authority."""
+        """Change the running direction after the driver has changed ends; the train then has no authority."""
         self.direction, self.end_m, self.before_turn = direction, front_m, self._newest
         self._granted, self.answered_s, self._place_m, self.stops_at_m = False, None, None, None
         self._motion, self.authority = None, None

@@ -51,7 +51,9 @@ def stands(message: TrainMessage) -> bool:
 
 
 def confirms_rear(known: TrainInterval, message: TrainMessage) -> bool:
-    """Return whether a report may move the safe rear end: the train is complete and has its configured length."""
+    """Return whether a report may move the safe rear end, which requires that the train is complete and has its
+    configured length.
+    """
     return message.complete and abs(message.length_cm / 100.0 - known.length_m) <= LENGTH_ROUNDING_M
 
 
@@ -112,7 +114,7 @@ class PlacedReport:
 
 
 def no_length(report: PlacedReport) -> str | None:
-    """Return a contradiction if a report has no train length, otherwise None."""
+    """Return the reason for rejecting a report without a train length, None for other reports."""
     return "the report has no train length" if report.message.length_cm == 0 else None
 
 

@@ -325,7 +325,9 @@ def _centre(
 
 
 def _stored_points(store: Store) -> dict[PointName, int]:
-    """Return the stored track of each set of simulated points: the detected track or, if None, the commanded track."""
+    """Return the track for which each set of simulated points lies: the detected track in the store or, without a
+    detection, the commanded track.
+    """
     texts = store.documents(HEAD)
     points = from_documents(texts).points if texts else {}
     return {name: point.detected or point.wanted for name, point in points.items()}

@@ -36,7 +36,7 @@ SESSION_S: Final = 1800.0
 #: Number of wrong passwords from one address within `WRONG_S` after which further log-ins from this address are
 #: refused.
 MOST_WRONG: Final = 10
-#: A wrong password is forgotten after this time [s].
+#: A login attempt with a wrong password no longer counts after this time [s].
 WRONG_S: Final = 60.0
 #: A connection with an incomplete request is ended after this time, at the latest after twice this time [s].
 REQUEST_S: Final = 10.0

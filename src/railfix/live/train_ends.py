@@ -112,9 +112,7 @@ class TrainFrame:
         return next(iter(self.trajectories))
 
     def first_antenna_ecef_m(self, name: str, arc_m: float) -> Floats:
-        """Return the first antenna's position (ECEF), shape (3,) [m], computed from an antenna's position along the
-        line.
-        """
+        """Return the first antenna's position (ECEF), shape (3,) [m], from the arc length of antenna `name`."""
         first, trajectory = self.trajectories[self.first], self.trajectories[name]
         if name != self.first:
             arc_m = float(first.arc_of_body(trajectory.body_at(arc_m)))

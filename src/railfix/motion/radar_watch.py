@@ -63,7 +63,7 @@ class RadarWatch:
     _sums: Floats = field(default_factory=lambda: np.zeros(4))
 
     def take(self, time: Datetimes, radar_mps: Floats, right_mps: Floats) -> list[RadarAlarm]:
-        """Add radar and satellite-derived speeds, and return the resulting alarms.
+        """Process new radar speeds and satellite-derived speeds, and return the resulting alarms.
 
         All arrays have shape (N,). `time` must be later than all previous times. `right_mps` are the satellite-derived
         speeds. Missing speeds are NaN.

@@ -40,7 +40,7 @@ class BaliseLimits(Settings):
 class BaliseState:
     """Last balise read before a chunk."""
 
-    balise: str = ""  #: Identity of the balise; blank before the first.
+    balise: str = ""  #: Identity of the balise; blank before the first balise has been read.
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     turn: int = 1  #: Column (0 or 1) of the balise in `railfix.tracking.BaliseEpochs`.
 

@@ -308,7 +308,7 @@ POSITION_COLUMNS: Final[Mapping[str, Column[AntennaResult]]] = by_name(
         ),
         Column(
             "map_offset_statistic",
-            "squared normalised map offset; the status is `map_offset` from 13.8 on",
+            "squared normalised map offset; the status is `map_offset` at 13.8 or more",
             "map_offset.statistic",
         ),
         Column(

@@ -77,7 +77,9 @@ def _known_speeds(time: Datetimes, speed_mps: Floats, sigma_mps: Floats) -> Spee
 
 
 def combine_speeds(time: Datetimes, sources: Sequence[Speeds]) -> tuple[Floats, Floats]:
-    """Return the mean speed, weighted by inverse variances, and its sigma, shapes (N,); NaN without speeds."""
+    """Return the mean speed, weighted by inverse variances, and its sigma, shapes (N,). Both are NaN where no source
+    has a speed.
+    """
     weight, total = np.zeros(len(time)), np.zeros(len(time))
     for source in sources:
         at = nearest_rows(time, source.time, within_ns=SAME_INSTANT_NS)

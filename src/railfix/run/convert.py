@@ -52,7 +52,7 @@ def convert_logs(
     "refuse"), is an input, or cannot be written.
     """
     if out is not None and nav_out is not None and out.resolve() == nav_out.resolve():
-        raise OutputError(f"{out}: is given by --out and by --nav-out; give another file for one of them")
+        raise OutputError(f"{out}: is given by both --out and --nav-out; give another file for one of them")
     for target in (out, nav_out):
         if target is not None:
             check_output_file(target, overwrite=overwrite, inputs=logs)

@@ -55,7 +55,7 @@ NONE: Final = "none"
 
 #: Columns that position tables of a run on a network have in addition.
 ON_TRACK_COLUMNS: Final[dict[str, str]] = {
-    "track": "track of the network on which the position lies; it is part of the route found from the log",
+    "track": "track of the network on which the position lies; the track is part of the route found from the log",
     "track_chainage_m": "distance in plan along `track` from the first point of the track to the antenna",
     "track_probability": "probability, given the whole log, that the train is on the route at this position; "
     "`tracks.csv` has the alternatives",

@@ -89,7 +89,8 @@ def standstill_codes(
     places = places[np.isfinite(places[:, 0])]
     if len(places) < 2:
         raise NoPositionError("the log has no position; check that the navigation files are from the day of the log")
-    # three parts, because a train that returns to its position has equal positions at the beginning and end of the log
+    # three parts, because a train that returns to its starting position has equal positions at the beginning and end of
+    # the log
     thirds = np.array([np.median(part, axis=0) for part in np.array_split(places, min(3, len(places)))])
     level = (thirds - thirds[0]) @ axes_at(places[0])[:2].T
     moved = float(np.linalg.norm(level, axis=1).max())

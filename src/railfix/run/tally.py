@@ -339,7 +339,8 @@ TABLES: Final[Mapping[str, Callable[[Result], pl.DataFrame | None]]] = {
 
 
 def make_tables(result: Result, *, passings: bool) -> dict[str, pl.DataFrame]:
-    """Return the tables of a chunk by name. Filtered positions and passings (optional) exist only with the filter.
+    """Return the tables of a chunk, with the name of each table as key. Filtered positions and passings (optional)
+    exist only with the filter.
 
     The table of passings may have no rows.
     """

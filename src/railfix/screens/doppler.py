@@ -71,7 +71,8 @@ class DopplerLimits(Settings):
 
 
 def doppler_limit_m(interval_s: ArrayLike, *, limits: DopplerLimits | None = None) -> Floats:
-    """Return the limit [m] of mode "fixed" at an interval; by default 1.50 up to 0.2 s, 2.88 at 1 s, 3.94 at 2 s.
+    """Return the limit [m] of mode "fixed" for an interval between epochs. By default it is 1.50 m up to 0.2 s, 2.88 m
+    at 1 s and 3.94 m at 2 s.
 
     The limit is ``step sqrt((1 - exp(-dt / correlation)) / (1 - exp(-short / correlation))) + jerk dt^3 / 12``. In the
     first term dt is at least `short_interval_s`; the second term is 0 up to `short_interval_s`.

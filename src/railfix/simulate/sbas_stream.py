@@ -154,8 +154,8 @@ class SimulatedDfmc(Service):
         return [of_kind(35, slice(0, FIRST)), *later]
 
     def slow_messages(self) -> list[Callable[[int], Bytes]]:
-        """Return the messages of types 31 and 37, and one of type 32 for each satellite, each as a function of the
-        second.
+        """Return functions that make a message from its time [s]: for type 31, for type 37, and for type 32 of each
+        satellite.
         """
         slots = [self.slot(name) for name in self.satellites]
         messages: list[Callable[[int], Bytes]] = [

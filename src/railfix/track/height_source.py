@@ -61,7 +61,7 @@ def check_raster(path: FilePath, *, geoid: str | None, height_datum: str | None,
     if sigma_m is None:
         asked.append("sigma_height_m (--height-sigma), the accuracy of the heights in metres")
     if asked:
-        raise SettingsError(f"{path}: a raster does not state the reference of its heights; give {', '.join(asked)}")
+        raise SettingsError(f"{path}: the raster does not state the reference of its heights; give {', '.join(asked)}")
 
 
 def with_heights(

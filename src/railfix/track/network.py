@@ -147,7 +147,9 @@ class Network(NotebookTable):
 
     @cached_property
     def passages(self) -> dict[tuple[int, int], dict[tuple[int, int], None]]:
-        """For each track end, the ends of other tracks to which a train can pass; an end is a pair (track, end)."""
+        """For each track end, the ends of other tracks to which a train can pass. A track end is the pair of the
+        track's index and 0 or 1.
+        """
         passages: dict[tuple[int, int], dict[tuple[int, int], None]] = {}
         for link in self.links:
             if link.navigable:

@@ -25,7 +25,7 @@ _COARSE_DEG: Final = 1e-5  #: Coordinates in steps of this count as rounded [deg
 _LEAST_CANT_M: Final = 5e-4  #: If the largest cant of a map is below this [m], the unit of the cant must be wrong.
 _NEAR_DUPLICATE_M: Final = 0.10  #: Spacing below which two points are reported as one point measured twice [m].
 _CURVED_1PM: Final = 1 / 3000  #: Curvature below which the track counts as straight [1/m].
-_ADVERSE_M: Final = 0.005  #: The sign of the cant is not checked up to this absolute value [m].
+_ADVERSE_M: Final = 0.005  #: The sign of a cant with at most this absolute value is not checked [m].
 _CENTIMETRE_M: Final = 0.01  #: Distance between chord and arc for which `needed_spacing_m` is computed [m].
 #: A point is a kink if the direction changes by more than this angle and the radius is below `least_radius_m`.
 _KINK_DEG: Final = 3.0

@@ -147,7 +147,7 @@ class Trajectory(FrozenArrays, NotebookTable):
     rear_end_m: float | None = None
     #: Distance between the wheels' contact points, over which cant is measured; None without a vehicle.
     contact_m: float | None = None
-    sigma_plan_m: float = SIGMA_PLAN_M  #: Standard deviation of the map in plan, used in the solution.
+    sigma_plan_m: float = SIGMA_PLAN_M  #: Standard deviation of the map's error in plan, which the solution assumes.
     sigma_height_m: float = SIGMA_HEIGHT_M  #: Standard deviation of the map in height, used in the solution.
     notes: tuple[str, ...] = ()  #: Notes that are copied to every result.
 

@@ -97,6 +97,6 @@ class TrackingLimits(Settings):
     #: Probability that the map is wrong by more than its stated sigma; sigma of the map in this case. Both are assumed.
     level_map_prior: float = Field(default=1e-3, ge=0, lt=1)
     level_map_m: float = Field(default=30.0, gt=0)
-    #: Probability of an ionospheric storm or the equatorial anomaly. The sigma of slow code errors is then
-    #: `tracking.line.TILT_M` instead of `slow_code_m`. The value is an assumption.
+    #: Probability that an ionospheric storm or the equatorial anomaly tilts the ionosphere at a given time. The sigma
+    #: of slow code errors is then `tracking.line.TILT_M` instead of `slow_code_m`. The value is an assumption.
     level_tilt_prior: float = Field(default=1e-3, ge=0, lt=1)

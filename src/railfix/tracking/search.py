@@ -86,7 +86,7 @@ def begin(
     """Return means, shape (H, N), and covariances, shape (H, N, N), of new hypotheses at `arc_m` [m], shape (H,).
 
     `satellites` is the number of satellite errors in the state. `known` are the mean and covariance of a lost track;
-    their sensor errors are kept. Clocks and satellite errors restart.
+    their sensor errors are kept. Clocks and satellite errors are reset.
     """
     width = ix.SATELLITES + satellites
     mean = np.zeros((len(arc_m), width))

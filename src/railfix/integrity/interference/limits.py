@@ -127,8 +127,8 @@ class InterferenceLimits(Settings):
     #: not detected yet. With "on", the protection level is two to four times as large.
     wheel_level: Literal["on", "off"] = "off"
     #: With `wheel_level` on, the level is at least the GNSS-wheel distance difference plus this number of combined
-    #: sigmas of wheel distance and position at the window start. The default is for a probability of 1e-7 that spoofing
-    #: began within the window and an integrity risk of 1e-9.
+    #: sigmas of wheel distance and position at the window start. The default assumes that spoofing began within the
+    #: window with a probability of 1e-7, and that the integrity risk is 1e-9.
     wheel_level_sigmas: float = Field(default=2.33, ge=0)
     #: Relative standard deviation of the wheel circumference before its estimation from positions.
     wheel_scale: float = Field(default=0.01, gt=0)

@@ -193,7 +193,7 @@ class Shared(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Number of shared faults, the map included."""
+        """Number of shared faults, including the map fault."""
         return len(self.events) + self.wrong_map
 
 

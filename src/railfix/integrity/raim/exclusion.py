@@ -52,7 +52,7 @@ class RaimLimits(Settings):
     #: 1 means K = 0, as in ``HSlope sigma0 sqrt(lambda)`` of P4.
     noise_risk: float = Field(default=1e-3, gt=0, le=1)
     alarm_limit_m: float = Field(default=20.0, gt=0)  #: Alarm limit of the level. P4 accepts a car length, 20 m.
-    faults: int = Field(default=1, ge=1, le=2)  #: Number of simultaneous faults covered by the level; 1 in P4.
+    faults: int = Field(default=1, ge=1, le=2)  #: Number of simultaneous faults that the level covers; 1 in paper P4.
 
     @model_validator(mode="after")
     def _rates_below_one(self) -> Self:

@@ -29,7 +29,7 @@ class Lines:
     data: Bytes  #: Text of the block, followed by blanks, because fixed columns may extend beyond the last line.
     start: Integers  #: Offset of each line in `data`, shape (n,).
     length: Integers  #: Length of each line without the line end (LF or CR LF), shape (n,).
-    stop: Integers  #: Offset in `data` of the line after each line, shape (n,).
+    stop: Integers  #: Offset in `data` of the first character after each line, shape (n,).
     number: Integers  #: Line number of each line in the decompressed file, from 1; shape (n,).
 
     def __len__(self) -> int:

@@ -77,7 +77,8 @@ LARGEST_SCALE: Final = 3.0  #: Upper bound of the logarithm of a variance scale 
 #: While the mean weight of phases and Dopplers is not low, the timer of low weights decreases by this fraction of the
 #: time. It is not reset, because weights that are low in every second epoch also show a contradiction.
 MOTION_LEAK: Final = 0.5
-CODE_LEAK: Final = 1.0  #: Rate at which the timer of low code weights decreases while the weights are not low.
+#: Factor on the elapsed time by which the timer of low code weights decreases while the weights are not low.
+CODE_LEAK: Final = 1.0
 
 # Satellites with persistent code errors.
 BIAS_MEMORY_S: Final = 60.0  #: Time constant of the mean normalised innovation of a satellite's codes [s].

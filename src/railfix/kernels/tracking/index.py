@@ -82,8 +82,8 @@ class TrackStatus(IntEnum):
     NOT_STARTED = 5
     #: No position: all positions of the last 10 s contradicted the line.
     OFF_MAP = 6
-    #: One position, but 3-D positions of the last minutes are beside or above the line, or other tracks of the network
-    #: are more probable than `track_risk`.
+    #: The position may be on a wrong line: 3-D positions of the last minutes are beside or above the line, or the
+    #: probability of other tracks of the network exceeds `track_risk`.
     MAP_OFFSET = 7
     #: One position, but in the last 20 s the distance between both antennas was wrong by more than 5 m and four sigmas,
     #: or their speeds differed by more than 1.5 m/s and four sigmas.

@@ -89,7 +89,9 @@ def _predict_all(given: Given, t: int, state: State) -> None:
 
 @inner
 def _start_correction(given: Given, t: int, state: State, rows: Rows, h: int) -> Correction:
-    """Return the correction of a predicted hypothesis before the first fit, with its equations and innovations."""
+    """Return the initial state of the correction of a predicted hypothesis: its equations and innovations, not yet
+    fitted.
+    """
     x, P, equations = state.x[h].copy(), state.P[h].copy(), new_equations(rows)
     restarted = np.zeros(len(x), dtype=np.bool_)
     sign = find_wheel_sign(x, state.monitors[0].direction)

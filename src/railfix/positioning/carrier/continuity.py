@@ -101,7 +101,7 @@ class ContinuityLimits(Settings):
     #: Constant part of the standard deviation of lateral and vertical motion, due to errors of map points.
     aside_m: float = Field(default=0.02, gt=0)
     #: Standard deviation of lateral motion due to direction errors, as a fraction of the distance moved. On a curve of
-    #: 300 m radius, a position error of 5 m is a direction error of 0.017 rad.
+    #: 300 m radius, a position error of 5 m corresponds to a direction error of 0.017 rad.
     across_share: float = Field(default=0.02, gt=0)
     #: Standard deviation of vertical motion due to gradient errors, as a fraction of the distance moved. On a vertical
     #: curve of 2000 m radius, a position error of 5 m is a gradient error of 0.0025 rad.

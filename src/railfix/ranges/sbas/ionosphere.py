@@ -241,7 +241,9 @@ def _cells(latitude: Floats, longitude: Floats) -> Iterator[Callable[[Indices], 
 def _choose(
     grid: GridTables, time: Datetimes, span: Integers, latitude: Floats, longitude: Floats
 ) -> tuple[Integers, Floats, Floats]:
-    """Return cell corners (M, 4) below 75 deg latitude, -1 if unused, and the relative positions x, y in cells (M,)."""
+    """Return the corners of the grid cell (M, 4) and the relative position x, y in the cell (M,) of points below 75 deg
+    latitude. Corners are -1 where a corner is unused.
+    """
     point = np.full((len(latitude), 4), _NO_POINT, dtype=np.int64)
     x, y = np.zeros((2, len(latitude)))
     open_ = np.isfinite(latitude) & (np.abs(latitude) < _POLAR_DEG)
