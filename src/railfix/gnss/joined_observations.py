@@ -117,7 +117,7 @@ def _join_headers(headers: Sequence[ObservationHeader]) -> ObservationHeader:
 
 
 def stack_observations(observations: Sequence[Observations]) -> tuple[Observations, tuple[slice, ...]]:
-    """Stack the epochs of several antennas, with the union of their channels; also return the rows by antenna."""
+    """Stack the epochs of several antennas, with the union of their channels; also return each antenna's rows."""
     first, *others = observations
     if not others:
         return first, (EVERY,)
@@ -126,7 +126,7 @@ def stack_observations(observations: Sequence[Observations]) -> tuple[Observatio
         (each.satellite.tobytes(), each.signal.tobytes(), *sorted(each.header.glonass_channel.items()))
         for each in observations
     }
-    same = len(keys) == 1  # the channels and GLONASS frequencies of all antennas are equal
+    same = len(keys) == 1  # all antennas have the same channels and GLONASS frequencies
     stacked = join_epochs(observations) if same else stack_parts(observations)
     return stacked, tuple(slice(a, b) for a, b in pairwise(ends))
 
@@ -138,6 +138,6 @@ def signals_by_system(satellite: Strings, signal: Strings) -> dict[str, tuple[st
 
 
 def first_problems(messages: Iterable[str], *, count: int) -> tuple[str, ...]:
-    """Return at most `MAX_PROBLEMS` messages, and one with the number of the other faults; `count` faults in all."""
+    """Return at most `MAX_PROBLEMS` messages, and a message with the number of further faults; `count` includes all."""
     kept = tuple(islice(messages, MAX_PROBLEMS))
     return (*kept, f"and {count - len(kept)} more problems") if count > len(kept) else kept

@@ -79,7 +79,7 @@ class KeplerRecords(_NavigationRecords):
     cis: Floats
     #: Toe in seconds of the constellation's week (BDT for BeiDou), used for the longitude of the node; shape (n,).
     toe_sow_s: Floats
-    #: Health: SV health of GPS, QZSS (CNAV: bits of L1, L2, L5), 9 bits of Galileo, SatH1 (CNV: HS) of BeiDou; (n,).
+    #: GPS, QZSS: SV health (CNAV: bits of L1, L2, L5). Galileo: 9 bits. BeiDou: SatH1 (CNV: HS). Shape (n,).
     health: Integers
     #: URA or SISA as in the file; nominal value of the URA_ED index for CNAV, NaN for CNV1 to CNV3; shape (n,).
     accuracy_m: Floats

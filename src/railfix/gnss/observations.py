@@ -95,8 +95,8 @@ class Observations(NotebookTable):
     #: Front-end gain, in the receiver's unit, NaN where unknown; shape (T,).
     front_end_gain: Floats = field(default_factory=lambda: np.zeros(0))
     header: ObservationHeader = field(default_factory=ObservationHeader)
-    #: Messages on faulty parts of the file, which were skipped (file, line, fault): at most `MAX_PROBLEMS`, then one
-    #: with the number of further faults. Selected epochs (`log[10:20]`) have no messages.
+    #: Messages (file, line, fault) on faulty parts of the file, which were skipped: at most `MAX_PROBLEMS` messages,
+    #: then one message with the number of further faults. Selected epochs (`log[10:20]`) have no messages.
     problems: tuple[str, ...] = ()
     problem_count: int = 0  #: Number of all faults, with and without a message.
     #: Number of skipped items by kind: malformed epochs and satellite lines, duplicate epochs, external events,

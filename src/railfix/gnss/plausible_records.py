@@ -17,9 +17,9 @@ from railfix.core.constants import EARTH_ROTATION_RATE
 from railfix.core.timescale import seconds
 from railfix.gnss.navigation import GlonassRecords, KeplerRecords, Navigation
 
-#: Lower and upper limits of plausible semi-major axes [m], by constellation and type of orbit; E14 and E18 are at
-#: 27,978 km. Of 2,104 broadcast records of ten days from 2005 to 2025, one is outside: a QZSS orbit under the number of
-#: a GPS satellite (`tests/gnss/test_plausible_records.py`).
+#: Lower and upper limits of plausible semi-major axes [m], by constellation and type of orbit; E14 and E18 have axes of
+#: 27,978 km. Of 2,104 broadcast records of ten days from 2005 to 2025, one is outside the limits: a QZSS orbit under
+#: the number of a GPS satellite (`tests/gnss/test_plausible_records.py`).
 _AXES_M: Final[Mapping[str, tuple[tuple[float, float], ...]]] = {
     "G": ((26.2e6, 26.9e6),),
     "E": ((27.7e6, 28.3e6), (29.3e6, 29.9e6)),
@@ -28,10 +28,10 @@ _AXES_M: Final[Mapping[str, tuple[tuple[float, float], ...]]] = {
 }
 #: Largest plausible eccentricities. The GPS limit is from IS-GPS-200 (20.3.3.4.1). E14 and E18 have 0.17, QZSS 0.075.
 _ECCENTRICITIES: Final[Mapping[str, float]] = {"G": 0.05, "E": 0.2, "C": 0.05, "J": 0.12}
-#: Limits of plausible radii of GLONASS, and of semi-major axes computed from position and velocity [m]. The GLONASS
-#: records among 2,104 broadcast records have 25,416 to 25,602 km.
+#: Lower and upper limit for GLONASS, both of the radius and of the semi-major axis from position and velocity [m]. The
+#: GLONASS records among 2,104 broadcast records have values of 25,416 to 25,602 km.
 _GLONASS_M: Final = (25.3e6, 25.7e6)
-#: Largest plausible difference between toe and toc of a record; they are equal in 2,104 broadcast records.
+#: Largest plausible difference between toe and toc of a record; toe equals toc in 2,104 broadcast records.
 LARGEST_TIME_DIFFERENCE_S: Final = 300.0
 _EARTH_GM: Final = 3.986004418e14  #: Geocentric gravitational constant [m^3/s^2].
 _NAMES: Final = {"G": "GPS", "E": "Galileo", "C": "BeiDou", "J": "QZSS", "R": "GLONASS"}

@@ -82,7 +82,7 @@ class Authority(Message):
 class BrakeOrder(Authority):
     """Order to brake to a stop, sent before the centre has stored it, and repeated until a report acknowledges it.
 
-    `number` is the number of the latest authority. A later authority without `stopped` ends the order.
+    `number` is the number of the latest authority. A later authority whose `stopped` is false ends the order.
     """
 
     kind: ClassVar[int] = 2

@@ -70,7 +70,7 @@ class ReferenceCurve:
         )
 
     def running_m(self, from_m: float, elapsed_s: float) -> float:
-        """Return the position [m] of a train `elapsed_s` after it was at `from_m`; it stops at the next station."""
+        """Return a train's position [m] `elapsed_s` after it was at `from_m`; the train stops at the next station."""
         at = np.interp(self.direction * from_m, self.direction * self.chainage_m, self.running_s)
         place = float(np.interp(at + max(elapsed_s, 0.0), self.running_s, self.chainage_m))
         ahead = self.direction * (self.stations_m - from_m)
@@ -118,7 +118,7 @@ class CentreLimits(Settings):
     error_s: float = Field(default=120.0, gt=0)  #: Time without an accepted report after which a train is in error.
     age_s: float = Field(default=5.0, gt=0)  #: Largest age of a position when it is sent; older positions are rejected.
     #: A position is rejected if its time is ahead of the train's own clock by more than this. As this lead may vary,
-    #: the centre adds this value to the time between two positions when it checks a train's distance.
+    #: the centre adds this value to the time between two positions when it checks the distance run.
     clock_s: float = Field(default=1.0, ge=0)
     #: A report is rejected if its sequence number exceeds the newest number by more than `jump`, plus `rate` for each
     #: second since the newest number arrived.
@@ -226,7 +226,7 @@ def time_passed(
     authority_m: float | None = None,
     limits: CentreLimits,
 ) -> TrainRecord:
-    """Return the record at a later instant; if reports are missing, it has a new state and a simulated position.
+    """Return the record at a later instant; without reports, the record has a new state and a simulated position.
 
     Parameters
     ----------

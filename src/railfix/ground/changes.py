@@ -59,9 +59,9 @@ def correct_interval(
 ) -> Changed:
     """Set the interval of a stopped train; return the new state, and the reason if the order is refused.
 
-    The train's route and authority end, and the train's locks on points are removed. Therefore, either all authorities
-    must have lapsed on board (`lapsed`), or the train must have reported that it obeys an order to brake, and no
-    authority in transit can end this order.
+    The train's route and authority end, and the train's locks on points are removed. Therefore, one of two conditions
+    is required: all authorities have lapsed on board (`lapsed`), or the train has reported that it obeys an order to
+    brake that no authority in transit can end.
     """
     known = state.trains.get(train)
     if known is None:
@@ -139,8 +139,8 @@ def remove_train(state: Interlocking, train: int, layout: Layout, *, lapsed: boo
     """Remove a train; the sections of the train's interval then count as occupied by vehicles that do not report.
 
     A section becomes free when its detection reports it free, or by the order of a person who has seen that it is free.
-    As in `correct_interval`, no authority in transit may permit the train to run. Return the new state, and the reason
-    if the order is refused.
+    As in `correct_interval`, the order is refused if an authority in transit can permit the train to run. Return the
+    new state, and the reason if the order is refused.
     """
     known = state.trains.get(train)
     if known is None:
@@ -153,7 +153,7 @@ def remove_train(state: Interlocking, train: int, layout: Layout, *, lapsed: boo
     trains = {number: other for number, other in state.trains.items() if number != train}
     state = replace(state, trains=trains, points=without_locks(state.points, train))
     for name, own in layout.sections.items():
-        # the section of a whole station is closed only if the train is on the points; each track is another section
+        # the section of a whole station is closed only if the train is on the points; each track is its own section
         if overlap(own if len(own) == 1 else [piece for piece in own if piece[0] == 0], pieces):
             state = close_section(state, name, layout, f"{name} is {OCCUPIED}", kind=OCCUPIED)
     return state, None

@@ -86,7 +86,7 @@ class ControlCentre:
     commits: Commits = field(default_factory=Commits)
     #: Function that requests the detection of a set of points; `Supervision.set_detected` processes the answer.
     ask: Callable[[PointName], None] = lambda _: None
-    #: Interference suspected in the newest report of each train.
+    #: Interference that each train suspects according to its newest report.
     interference: dict[int, SuspectedInterference] = field(default_factory=dict)
 
     _routes: dict[int, int] = field(init=False)
@@ -104,8 +104,8 @@ class ControlCentre:
         """Return the centre with the state stored by an earlier process; at the first start, with the given state.
 
         After a restart, trains are unknown until they report, and the detection of all points is requested. With a
-        triangle (`judged`), all trains are stopped from the first start until a release by hand. A stop from before a
-        restart remains.
+        triangle (`judged`), all trains are stopped from the first start until a release by hand. A stop ordered before
+        a restart stays in force.
         """
         texts, monitor = store.documents(HEAD), MonitorState() if judged else None
         asked: tuple[PointName, ...] = ()
@@ -260,7 +260,7 @@ class ControlCentre:
         return changed, partial(self.store.save, *changed, documents=documents)
 
     def save_last(self, writer: ThreadWriter) -> Future[None]:
-        """Queue a last commit without messages, because orders to brake do not wait for the commit of their stop."""
+        """Queue a last commit that sends no messages; it stores stops whose orders to brake are already sent."""
         return writer.submit(self._unsaved()[1])
 
     def settle(self) -> None:
@@ -281,7 +281,7 @@ class ControlCentre:
         self.send(order.train, order.encode())
 
     def _send(self, authority: Authority) -> None:
-        """Send an authority, unless its train has meanwhile been ordered to brake, or is no longer supervised."""
+        """Send an authority to a supervised train; while the train is ordered to brake, only if `stopped` is true."""
         if authority.train not in self.supervision.state.trains:
             return
         if authority.train not in self.supervision.ordered:

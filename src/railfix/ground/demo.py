@@ -58,7 +58,7 @@ class LinkDisturbance:
         self._random = random.Random(settings.seed)
 
     def packet(self, data: bytes, send: Callable[[bytes], None]) -> None:
-        """Forward a packet by `send`, or drop it."""
+        """Forward a packet by calling `send`, or drop the packet."""
         if not self.up or self._random.random() < self.settings.loss:
             return
         delay_s = self.settings.delay_s + self._random.uniform(0.0, self.settings.jitter_s)

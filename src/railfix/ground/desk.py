@@ -80,7 +80,7 @@ class OrderDesk:
         )
 
     def asked_s(self, name: str, values: Values) -> float:
-        """Return the time at which an equal order that awaits confirmation was given, or the present time [s]."""
+        """Return the time of an equal order that awaits confirmation; without such an order, the present time [s]."""
         key = f"{name} {json.dumps(values, sort_keys=True)}"
         return self._asked.get(key, (self.clock(), ""))[0]
 
@@ -202,7 +202,7 @@ class OrderDesk:
         return None
 
     def restrict(self, values: Values, by: str) -> str | None:
-        """Set a named temporary speed restriction, or lift it when ordered a second time."""
+        """Set a named temporary speed restriction at once, or lift a restriction if this is ordered twice."""
         supervision, name = self.supervision, str(values.get("name", "")).strip()
         state = supervision.state
         if not 0 < len(name) <= 40:

@@ -225,7 +225,7 @@ def fallen_cn0(level_dbhz: Floats, earlier_dbhz: Floats) -> Masks:
     return np.asarray(level_dbhz < usual[len(earlier_dbhz) :] - FALLEN_DBHZ)
 
 
-#: Largest number of epochs that wait until every receiver has sent them; the oldest is then dropped.
+#: Largest number of epochs that wait until every receiver has sent them; if more wait, the oldest is dropped.
 _LONGEST_QUEUE: Final = 1000
 
 

@@ -59,7 +59,7 @@ class NearbyTrains:
         return self._layout.blocks_between(min(low, furthest), max(high, furthest))
 
     def _move(self, blocks: range, number: int, before: range) -> None:
-        """Enter a train in `blocks`, and remove it from the blocks `before`."""
+        """Enter a train in the new blocks (`blocks`), and remove the train from its earlier blocks (`before`)."""
         if blocks == before:
             return
         for block in before:

@@ -22,7 +22,7 @@ with needs_extra():
 
 VALID_DAYS: Final = 365  #: Validity of the certificates of the centre and of trains [days].
 AUTHORITY_DAYS: Final = 3650  #: Validity of the authority's certificate [days].
-WARNING_DAYS: Final = 30  #: Remaining validity of a certificate at which an alarm is raised [days].
+WARNING_DAYS: Final = 30  #: An alarm is raised if a certificate expires within this time [days].
 _ISSUER: Final = "railfix authority"
 _PEM: Final = serialization.Encoding.PEM
 
@@ -70,7 +70,7 @@ class Revoked(NamedTuple):
 
 
 def read_revoked(folder: Path) -> Revoked:
-    """Return the revoked certificates listed in ``revoked.txt``, separated by blanks; without this file, none.
+    """Return the revoked certificates listed in ``revoked.txt`` (separated by blanks); none if the file is absent.
 
     A name (``train-7``) revokes all certificates of that name, including later certificates. A serial number
     (``0x5a1f...``, as printed by `railfix ground keys`) revokes one certificate, so that a train whose key was lost can
@@ -93,7 +93,7 @@ def ending_sentence(name: str, ends: datetime) -> str:
 
 
 def list_ending(folder: Path, name: str, *, now: datetime | None = None) -> list[str]:
-    """Return a sentence for each certificate of `name` or the authority that expires within `WARNING_DAYS`."""
+    """Return a sentence for each certificate (of `name` or of the authority) that expires within `WARNING_DAYS`."""
     limit = (now or datetime.now(UTC)) + timedelta(days=WARNING_DAYS)
     found = []
     for file in (f"{name}.pem", "authority.pem"):

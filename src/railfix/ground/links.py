@@ -29,7 +29,7 @@ KEPT: Final = 36_000
 
 
 class LinkResult(NamedTuple):
-    """Result of a frame: time [s] and position [m] at sending, and round-trip time [s], NaN without a timely answer."""
+    """Result of a frame: time [s] and position [m] at sending; round-trip time [s], NaN without an answer in time."""
 
     sent_s: float
     chainage_m: float
@@ -410,7 +410,7 @@ class CentreLinks:
             await asyncio.sleep(RETRY_S)
 
     def _note_ending(self) -> None:
-        """List the certificates of the authority, the centre and connected trains that expire within `WARNING_DAYS`."""
+        """List certificates that expire within `WARNING_DAYS`: of the authority, the centre and connected trains."""
         limit = datetime.now(UTC) + timedelta(days=WARNING_DAYS)
         peers = {protocol.peer: None for protocol in self._peers.values() if protocol.peer is not None}
         soon = [ending_sentence(f"of {peer.name}", peer.ends) for peer in peers if peer.ends <= limit]

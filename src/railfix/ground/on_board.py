@@ -67,7 +67,7 @@ class OnBoard:
 
     direction: int
     #: End of the authority, initially the front end. Authorities move this end forward. An authority with which the
-    #: centre requests an earlier end moves the end back if the train can stop before it.
+    #: centre requests an earlier end moves the end back if the train can stop before the earlier end.
     end_m: float
 
     limits: OnBoardLimits = field(default_factory=OnBoardLimits)
@@ -178,7 +178,7 @@ class OnBoard:
     def _ends_order(self, authority: Authority) -> bool:
         """Return whether an authority ends the order to brake.
 
-        If it does not, this method only updates the time at which the answered report was sent.
+        If the order continues, this method only updates the time at which the answered report was sent.
         """
         assert self.order is not None
         if authority.number > self.order.number and not authority.stopped:
@@ -204,7 +204,7 @@ class OnBoard:
         """Return whether an authority may be accepted.
 
         A train without an authority accepts an earlier end only if it can stop before this end (`agrees`), and brakes
-        until then. A train with an authority accepts the message, but keeps its end unless it agrees.
+        until then. A train with an authority always accepts the message, but moves its end back only with `agrees`.
         """
         return not authority.shortens or agrees or self._granted
 
@@ -217,7 +217,7 @@ class OnBoard:
         return {"authority": self.number, "authority_end_cm": end_cm, **order}
 
     def age_s(self, now_s: float) -> float:
-        """Return the largest possible age of the newest authority [s]; infinite before the first."""
+        """Return the largest possible age of the newest authority [s]; infinite before the first authority."""
         return float("inf") if self.answered_s is None else now_s - self.answered_s
 
     def _steps(self) -> Steps:

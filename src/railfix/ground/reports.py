@@ -268,7 +268,7 @@ def covered_m(report: PlacedReport) -> tuple[float, float]:
 
 
 def _noted(report: PlacedReport, **interval: Any) -> TrainInterval:
-    """Return the train's record with the data of a report, even if contradicted, and with the values `interval`."""
+    """Return the train's record with the data of a report, even if contradictory, and the fields in `interval`."""
     message = report.message
     low, high = sorted((report.rear_m, report.ahead_m))
     noted: dict[str, Any] = {

@@ -267,7 +267,7 @@ async def run_centre(
 
 
 def _save_and_stop(control: ControlCentre, writer: ThreadWriter) -> bool:
-    """Commit the last state and stop the writer; return whether it has stopped in time. Raise DatabaseError."""
+    """Commit the last state and stop the writer; return whether the writer has stopped in time. Raise DatabaseError."""
     last = control.save_last(writer)
     stopped = writer.stop(ENDING_S)
     if last.done():

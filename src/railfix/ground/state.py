@@ -72,7 +72,7 @@ class TrainInterval:
     #: None before the first authority. Also None after a report that acknowledges an order to brake with this or a
     #: higher number, because no authority in transit can end that order.
     runs_by: int | None = None
-    stop: str | None = None  #: Reason why the train is stopped, kept until a release by hand; None if it is not.
+    stop: str | None = None  #: Reason for the train's stop, kept until a release by hand; None without a stop.
     asked_m: float | None = None  #: Earlier end of the authority that the train is requested to accept, if any.
     asked_number: int = 0  #: Number of the first authority that requests the earlier end.
     held: bool = False  #: Whether the train has given back its route; its next route is then set by hand.

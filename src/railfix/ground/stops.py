@@ -133,7 +133,7 @@ def points_refused(state: Interlocking, train: TrainInterval, under: Iterable[Po
 
 
 def bar_over(state: Interlocking, train: TrainInterval, layout: Layout) -> tuple[str, str] | None:
-    """Return a section in a train's interval that is closed for a reason in `BARS`, and this reason, or None."""
+    """Return a closed section in a train's interval with its reason in `BARS`; None if there is no such section."""
     occupied = pieces_of(train, layout)
     bars = (bar for bar in sorted(state.bars) if bar[1] in BARS)
     return next((bar for bar in bars if overlap(layout.sections[bar[0]], occupied)), None)
@@ -150,7 +150,7 @@ def close_section(
 
 
 def open_section(state: Interlocking, section: str, kind: str = CLOSED) -> Interlocking:
-    """Return the state without one reason for closing a section; trains stopped for it must be released by hand."""
+    """Return the state without one reason for closing a section; trains stay stopped until a release by hand."""
     return replace(state, bars=state.bars - {(section, kind)})
 
 

@@ -23,9 +23,9 @@ with needs_extra():
     from sqlalchemy import event
 
 _META: Final = sql.MetaData()
-#: Largest number of log lines that are kept in memory while the database fails.
+#: Largest number of log lines kept in memory while the database fails; if there are more, the oldest are dropped.
 MOST_NOTES: Final = 10_000
-#: Largest number of log lines in the database.
+#: Largest number of log lines in the database; older lines are deleted.
 MOST_LINES: Final = 1_000_000
 #: Name of the stored document that identifies the process in charge of the database.
 _IN_CHARGE: Final = "centre in charge"
@@ -160,7 +160,7 @@ class Store:
                 self._forget_old_lines(len(notes))
 
     def _forget_old_lines(self, added: int) -> None:
-        """Delete the log lines that exceed the limit, whenever a hundredth of the limit has been added."""
+        """Delete the oldest lines of the log beyond the limit, each time a hundredth of the limit has been added."""
         self._written += added
         if self._written <= self._most_lines // 100:
             return

@@ -131,8 +131,8 @@ class Supervision:
         """Return an upper bound of the time since the previous position [s], the delay of the train's clock, and
         whether this clock is new.
 
-        The bound is None if unknown. It is computed with the least delay of earlier reports; after a restart on board,
-        with the centre's clock alone. The delay behind the centre's clock [s] is returned with the time of its
+        The bound is computed with the least delay of earlier reports or, after a restart on board, with the centre's
+        clock alone; it is None if unknown. The delay behind the centre's clock [s] is returned with the time of its
         observation. A clock that was set back counts as new, because its earlier delays make later bounds too long.
         """
         number = message.train
@@ -174,8 +174,8 @@ class Supervision:
         """Begin with a stored state, which may be an older copy; return the points whose detection must be requested.
 
         No authority is extended until every train has acknowledged an authority or an order to brake sent since this
-        start. The acknowledging report states the end of the train's authority, which the database may not contain. The
-        train then rejects late authorities of the earlier process. Stored detections are dropped.
+        start. The acknowledging report states the end of the train's authority, which the database may not contain. A
+        train that has acknowledged rejects late authorities of the earlier process. Stored detections are dropped.
 
         The first authority number is the computer's time `wall_us` [us], so that it exceeds the numbers of earlier
         starts. If the computer's clock was set back, the numbers still exceed those in the database.

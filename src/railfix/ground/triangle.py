@@ -64,7 +64,7 @@ class TriangleLimits(Settings):
     #: Radius of the circle of allowable error. An error common to all receivers is not detected up to this size, and
     #: must be part of the error budget of the trains.
     radius_m: float = option("Radius of the circle of allowable error.", 12.0, name="--radius", metavar="M", gt=0)
-    #: Limit of the sides: largest deviation of the vector between two fixes from the vector between their points.
+    #: A side is above its limit if the vectors between its fixes and between its points differ by more than this [m].
     side_m: float = option("Largest error of the vector between two fixes.", 6.0, name="--side", metavar="M", gt=0)
 
     @model_validator(mode="after")
@@ -262,7 +262,7 @@ def advance(
     verdict : TriangleVerdict or None
         Verdict on the newest fixes; None without new fixes.
     receiver : int
-        Receiver that the verdict names.
+        Receiver that the verdict names, -1 if the verdict names none.
     limits : MonitorLimits
 
     Raises
@@ -322,7 +322,7 @@ class MonitoredLog:
 
     fixes: StationFixes
     triangle: TriangleResult
-    #: Orders to the trains: time, order, cause, and the receiver that the cause names, -1 if it names none.
+    #: Orders to the trains: time, order, cause, and the receiver that the cause names (-1 if the cause names none).
     orders: tuple[tuple[np.datetime64, Order, TriangleVerdict, int], ...]
 
     def table(self) -> pl.DataFrame:
@@ -363,8 +363,8 @@ class Monitor:
         """Process fixes at a clock time, by default at their time tags; return the verdicts and the orders to be sent.
 
         Trains are stopped if fixes are late, in logs as well as in streams. Each order is returned with the cause that
-        is known after the last fix, because later fixes may make it more exact. Raise SettingsError if the sides of the
-        triangle are too short for the limits.
+        is known after the last fix, because later fixes may make the cause more exact. Raise SettingsError if the sides
+        of the triangle are too short for the limits.
         """
         triangle, orders = judge_fixes(fixes, self.limits), []
         seconds = fixes.time.astype("datetime64[ns]").astype(np.int64) / 1e9

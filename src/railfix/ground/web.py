@@ -38,7 +38,7 @@ SESSION_S: Final = 1800.0
 MOST_WRONG: Final = 10
 #: A login attempt with a wrong password no longer counts after this time [s].
 WRONG_S: Final = 60.0
-#: A connection with an incomplete request is ended after this time, at the latest after twice this time [s].
+#: A connection whose request stays incomplete is ended after one to two times this time [s].
 REQUEST_S: Final = 10.0
 #: Largest number of connections; further connections are refused.
 MOST_CONNECTIONS: Final = 500
@@ -226,8 +226,8 @@ async def _values(request: Request) -> dict[str, Any] | None:
 class _TimedProtocol(H11Protocol):
     """HTTP protocol that ends connections whose request is not complete in time, even if bytes still arrive.
 
-    At most `MOST_IDLE` connections of a peer wait for a request; of more connections, the oldest are closed. A peer
-    with many connections therefore blocks neither other peers nor its own next request.
+    At most `MOST_IDLE` connections of a peer wait for a request; if more connections wait, the oldest are closed. A
+    peer with many connections therefore blocks neither other peers nor its own next request.
     """
 
     waiting: ClassVar[dict[tuple[int, str], dict[_TimedProtocol, None]]] = {}

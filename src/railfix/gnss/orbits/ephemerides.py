@@ -127,7 +127,7 @@ def _rotate(sine: Floats, cosine: Floats, angle: Floats) -> tuple[Floats, Floats
 
 
 def kepler_state(orbits: Orbits, since_toe_s: Floats) -> tuple[Components, Components, Floats]:
-    """Compute satellite states at times since toe, shape (n,) [s] (IS-GPS-200, tables 20-IV and 30-II).
+    """Compute satellite states at the times `since_toe_s` after toe, shape (n,) (IS-GPS-200, tables 20-IV and 30-II).
 
     The harmonic corrections of the argument of latitude and the inclination are small angles (at most 1.3e-4 rad).
     Return position [m] and velocity [m/s] in the Earth-fixed frame of the same time, and the relativistic clock
@@ -251,7 +251,7 @@ class GlonassStates:
         return cls(position, velocity, luni_solar)
 
     def state(self, row: Integers, since_toe_s: Floats) -> tuple[Floats, Floats]:
-        """Compute positions and velocities (3, n) of the rows `row` at `since_toe_s` (n,) after their reference times.
+        """Compute positions and velocities (3, n) of the records `row` (n,) at the times `since_toe_s` (n,) after toe.
 
         The times are between -`reach_s` and `reach_s`.
         """
@@ -280,7 +280,7 @@ _STATES: Final = 4096  #: Largest number of states computed at once, so that the
 
 
 def precise_clock_s(ephemeris: PreciseEphemeris, column: Indices, time: Datetimes, offset_s: Floats) -> Floats:
-    """Interpolate the clocks of a precise ephemeris linearly at ``time + offset``, shape (n,) [s]."""
+    """Interpolate the clocks of a precise ephemeris linearly at ``time + offset_s``, shape (n,) [s]."""
     left = np.clip(np.searchsorted(ephemeris.time, time, side="right") - 1, 0, len(ephemeris.time) - 2)
     step = seconds(ephemeris.time[left + 1] - ephemeris.time[left])
     part = (seconds(time - ephemeris.time[left]) + offset_s) / step
@@ -291,7 +291,7 @@ def precise_clock_s(ephemeris: PreciseEphemeris, column: Indices, time: Datetime
 def precise_state(
     ephemeris: PreciseEphemeris, column: Indices, time: Datetimes, offset_s: Floats
 ) -> tuple[Floats, Floats, Floats]:
-    """Compute positions and velocities (3, n), and clocks (n,) of satellites at ``time + offset``.
+    """Compute positions and velocities (3, n), and clocks (n,) of satellites at ``time + offset_s``.
 
     `column` is -1 where the ephemeris lacks a satellite; `offset_s` is a fraction of a second. The result is NaN where
     a position for the interpolation is missing, and where the time is outside the file or in a gap. The clock includes
@@ -357,7 +357,7 @@ def _rotate_axes(angle: Floats, vector: Floats) -> tuple[Floats, Floats, Floats]
 
 
 def _lagrange_at_zero(nodes: Floats, node_products: Floats) -> tuple[Floats, Floats]:
-    """Compute the Lagrange weights of the values at `nodes` for value and slope at 0, both of shape (P, n)."""
+    """Return the Lagrange weights of the nodes for the value at 0 and for the slope at 0, shape (P, n) each."""
     points = len(nodes)
     start = (np.ones(nodes.shape[1]), np.zeros(nodes.shape[1]))
     before, after = [start], [start]

@@ -1,4 +1,4 @@
-"""Select navigation records by satellite and by issue of data, with which SBAS corrections identify a record."""
+"""Select navigation records by satellite and issue of data; SBAS corrections name the issue of data of a record."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from railfix.gnss.orbits.prepared_records import validity_s
 
 _MILLISECOND: Final = np.timedelta64(1, "ms")
 _ISSUES: Final = 1024  #: Number of distinct issues of data (Galileo: 10 bits, others: 8 bits).
-#: Range of the times in a lookup key [ms]: 278 years.
+#: Number of distinct times in a lookup key, in steps of 1 ms: 278 years. Times outside this range are clipped.
 _ISSUE_SPAN: Final = np.int64(2**43)
 _ORIGIN: Final = np.datetime64("1980-01-06T00:00:00", "ns")
 
@@ -22,7 +22,7 @@ _ORIGIN: Final = np.datetime64("1980-01-06T00:00:00", "ns")
 class _Issues:
     """Index of records by satellite and issue.
 
-    Each record is used from the time half-way between the previous record's toe and its own toe.
+    Among records of one satellite and issue, the record with the nearest toe is used.
 
     Of two records with the same toe, the F/NAV record takes precedence over the I/NAV record.
     """
@@ -54,9 +54,9 @@ def _index_issues(navigation: Navigation) -> _Issues:
 
 
 def issue_records(navigation: Navigation, satellite: Strings, time: Datetimes, issue: Integers) -> Integers:
-    """Return the row of `navigation.kepler` with a given issue and the nearest toe, shape (T, M); -1 if none is valid.
+    """Return the row of `navigation.kepler` with a given issue and the nearest toe, shape (T, M).
 
-    The records are selected for the times of reception `time`, shape (T,), not for the times of transmission.
+    The row is -1 if this record is absent or not valid at the time of reception (`time`, shape (T,)).
     """
     table = _index_issues(navigation)
     number = np.array([table.number.get(str(name), -1) for name in satellite], dtype=np.int64)

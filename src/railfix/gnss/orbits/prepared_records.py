@@ -31,7 +31,7 @@ VALIDITY_S: Final[Mapping[str, float]] = {"G": 7200.0, "J": 7200.0, "E": 14_400.
 
 #: A transmission time counts as unknown if it differs from toe by more than the validity plus this time [s].
 _EARLY_S: Final = 3600.0
-#: Range of the times in a lookup key [ms]: 34 years.
+#: Number of distinct times in a lookup key, in steps of 1 ms: 34 years. Times outside this range are clipped.
 _SPAN: Final = np.int64(2**40)
 _MILLISECOND: Final = np.timedelta64(1, "ms")
 
@@ -126,8 +126,8 @@ QZSS_HEALTH: Final[Mapping[str, int]] = {
     "1C": 0b110_000, "1E": 0b100_001, "1S": 0b10, "1L": 0b10, "1X": 0b10,
     "2S": 0b1000, "2L": 0b1000, "2X": 0b1000, "5I": 0b100, "5Q": 0b100, "5X": 0b100,
 }  # fmt: skip
-#: A record with a larger URA or SISA counts as unhealthy [m]. This is so for URA indices from 8 (15 means no
-#: prediction; IS-GPS-200, 20.3.3.3.1.3); the GPS performance standard calls such a signal marginal.
+#: A record with a larger URA or SISA counts as unhealthy [m]. URA indices from 8 exceed this limit (15 means no
+#: prediction; IS-GPS-200, 20.3.3.3.1.3); the GPS performance standard calls signals with such indices marginal.
 LARGEST_ACCURACY_M: Final = 48.0
 #: Columns of `KeplerRecords.inter_signal_s` by GPS and QZSS signal; two columns (data and pilot) are averaged.
 _ISC: Final[Mapping[str, list[int]]] = {
@@ -257,7 +257,7 @@ class ChannelRecords:
     #: Indices of the channels with Keplerian records, shape (K,), and of the GLONASS channels, shape (R,).
     kepler: Indices
     glonass: Indices
-    #: Lookup numbers of the preferred message and of the alternative message; -1 if absent; shape (K,).
+    #: Lookup numbers of the preferred message and of the alternative message; -1 for an absent message; shape (K,).
     preferred: Integers
     other: Integers
 
@@ -265,7 +265,7 @@ class ChannelRecords:
     signal: Integers  #: Row of each channel in `group_delay_s` and `unhealthy`, shape (K,).
     group_delay_s: Floats  #: Group delay by signal and record, shape (signals, records).
     unhealthy: Masks  #: Whether a record flags a signal as unhealthy, shape (signals, records).
-    glonass_number: Integers  #: Lookup number of GLONASS channels, -1 without records; shape (R,).
+    glonass_number: Integers  #: Lookup number of GLONASS channels; -1 for satellites without records; (R,).
 
 
 class PreparedRecords:

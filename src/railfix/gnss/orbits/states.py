@@ -94,9 +94,9 @@ def satellite_states(
     max_age_s : float, optional
         Limit on the time between epoch and toe, in addition to the validity of the records [s].
     record : ndarray of int, shape (T, M), optional
-        Rows of `navigation.kepler` to use if corrections refer to one issue of data (`issue_records`); -1 to select as
-        without `record`. The record that would be selected without `record` may also flag a satellite as unhealthy.
-        Ignored for GLONASS.
+        Rows of `navigation.kepler` to use if corrections refer to one issue of data (`issue_records`); with -1, the
+        record is selected as without `record`. A signal is also unhealthy if the record selected without `record` flags
+        it as unhealthy. Rows for GLONASS are ignored.
 
     Raises
     ------
@@ -171,7 +171,7 @@ def _fill_kepler(
         states.group_delay_m[t, m] = SPEED_OF_LIGHT * plan.group_delay_s[signal, row]
         states.unhealthy[t, m] = plan.unhealthy[signal, row]
     if record is not None:
-        # Health is also taken from the newest record, where a correction refers to an older record.
+        # Where a correction refers to an older record, the newest record may also flag the signal as unhealthy.
         newest_unhealthy = plan.unhealthy[plan.signal[:, None], np.maximum(newest, 0)] & (newest >= 0)
         states.unhealthy[:, channels] |= newest_unhealthy.T
 
