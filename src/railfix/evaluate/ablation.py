@@ -54,7 +54,7 @@ _SENSORS: Final[Mapping[FilterSource, tuple[str, ...]]] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Effect:
-    """Rates and errors of one antenna with one choice of screens, or of filter sources."""
+    """Rates and errors of one antenna with one choice of screens or one choice of filter sources."""
 
     choice: str  #: Name of the choice, such as "all", "none", "only raim", "without raim", "filter without phase".
     screens: tuple[str, ...]  #: Active screens.

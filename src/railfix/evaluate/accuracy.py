@@ -66,7 +66,7 @@ def score(error_m: Floats, observed: Masks) -> Score:
 _SATELLITE_EDGES: Final = (4, 5, 6, 7, 8, 10, 12, 15, 20)
 #: Confidence limits are computed only from at least this number of time blocks.
 FEWEST_BLOCKS: Final = 5
-#: Number of error values at which one step of the search for a percentile counts the smaller errors.
+#: Number of nodes in one step of the search for a percentile. The errors up to each node are counted.
 _NODES: Final = 400
 
 
@@ -89,8 +89,8 @@ def block_limits(
 ) -> dict[str, float]:
     """Compute the confidence limits (`LIMIT_COLUMNS`) by a block bootstrap; return them with the number of blocks.
 
-    Errors, sigmas, the masks and the block numbers have shape (T,). Blocks are drawn with replacement `replicates`
-    times. The limits are NaN with fewer than `FEWEST_BLOCKS` blocks.
+    Errors, sigmas, the masks and the block numbers have shape (T,). Blocks are drawn with replacement for each of
+    `replicates` resamples. The limits are NaN with fewer than `FEWEST_BLOCKS` blocks.
     """
     names, member = np.unique(block, return_inverse=True)
     blocks = len(names)

@@ -105,7 +105,7 @@ def below(tables: Sequence[pl.DataFrame]) -> pl.DataFrame:
 
 
 def with_missing(time: Datetimes) -> tuple[Datetimes, Masks, float]:
-    """Return the epochs of a log with missing epochs added, a mask of logged epochs, and the median interval [s].
+    """Return all epochs of a log including missing epochs, the mask of logged epochs, and the median interval [s].
 
     Epochs are missing where an interval is longer than 1.5 times the median interval; the missing epochs are spread
     evenly over this interval. With fewer than two epochs, the median interval is NaN.

@@ -94,8 +94,8 @@ def along_track_error(
     The error is the distance along the line from the reference's nearest point on the map to the position. Where the
     map passes the reference more than once (laps, two carriageways of a road), the pass nearest to the position is
     used, because the ranges of one epoch cannot distinguish the passes. Where the line returns near itself (a
-    crossing), the straight distance between the two points is used if it is shorter. On a line that passes every point
-    once, these rules have no effect, except that the error in a curve is the length of the chord.
+    crossing), the straight distance is used if it is shorter. On a line that passes every point once, these rules have
+    no effect, except that the error in a curve is the length of the chord.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def along_track_error(
     reference_ecef_m : ndarray, shape (T, 3) [m]
         Reference positions.
     same_place_m : float [m]
-        The map counts as passing a reference position if it is at most this distance away from the position.
+        The map counts as passing a reference position if their distance is at most this.
     """
     error = np.full(len(arc_m), np.nan)
     at = np.flatnonzero(np.isfinite(arc_m) & np.isfinite(reference_ecef_m[:, 0]))
@@ -178,7 +178,7 @@ class Answers:
     ecef_m: Floats  #: Position computed with the map, ECEF, shape (T, 3); NaN without a position.
     #: Chainage of the reference, shape (T,); NaN where the reference has no position or no chainage.
     reference_chainage_m: Floats
-    reference_ecef_m: Floats  #: Position of the reference, shape (T, 3); NaN where it has none.
+    reference_ecef_m: Floats  #: Position of the reference, shape (T, 3); NaN where unknown.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,7 +191,7 @@ class PlaceErrors:
     #: Straight distance (3-D) of the position computed with the map, shape (T,): with the method "trajectory", from the
     #: point of the map nearest to the reference; with the method "chainage", from the reference position.
     distance_m: Floats
-    #: Chainage of the reference, or of the point of the map nearest to the reference if it has no chainage; shape (T,).
+    #: Chainage of the reference if it has one, else of the point of the map nearest to the reference; shape (T,).
     reference_chainage_m: Floats
     files: tuple[tuple[str, Path], ...] = ()  #: Kind ("track" or "vehicle") and path of each file that was read.
     notes: tuple[str, ...] = ()
@@ -281,7 +281,7 @@ def _note_of_passes(
 
 
 def _against_chainage(run: RunFolder, antenna: str, answers: Answers) -> tuple[str | None, bool]:
-    """Return the reason why differences of chainage cannot be used as errors, or None if they can.
+    """Return the reason why differences of chainage cannot be used as errors, or None if they can be used.
 
     Also return whether the chainage of the reference is on the map of the run.
     """

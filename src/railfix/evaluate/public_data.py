@@ -161,7 +161,7 @@ def _compute_rtk(program: str, folder: Path) -> PositionLog:
 
 
 def _write_truth(log: PositionLog, path: Path) -> None:
-    """Write to a CSV file the positions of a log whose standard deviations are below `_LARGEST_SIGMA_M`."""
+    """Write a log's positions with standard deviations below `_LARGEST_SIGMA_M` to a CSV file."""
     good = np.asarray((log.sigma_m < _LARGEST_SIGMA_M).all(axis=1))
     latitude, longitude, height = log.geodetic
     columns = {"latitude_deg": latitude, "longitude_deg": longitude, "height_m": height}

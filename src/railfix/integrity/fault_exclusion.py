@@ -52,7 +52,7 @@ class RaimResult(NotebookTable):
 def compute_statistic(
     ranges: Ranges, fix: LineFix, scale: ArrayLike = 1.0, *, limits: RaimLimits | None = None
 ) -> RaimResult:
-    """Return the statistic of the residuals and its threshold (P4), not compared: every outcome is UNTESTABLE."""
+    """Return the statistic of the residuals and its threshold (P4); they are not compared (outcome UNTESTABLE)."""
     return _untested(_detect(fix, ranges.redundancy, scale, limits or RaimLimits()), ranges.weight.shape, scale)
 
 
@@ -85,9 +85,9 @@ def exclude_faults(
 
     The sum of squared residuals is compared with a chi-square threshold (P4, false-alarm probability 1e-3), or with 100
     m^2 (P1 table 6, mode "fixed"). Every satellite and then every pair is left out in turn (P1 2.3(4), see `exclude`).
-    In chi-square mode, a robust fit must confirm the exclusion. If it keeps a range of a pair, the pair is not
-    excluded: other satellites may be faulty. Where the fault remains unresolved, `RaimResult.faulty` is True, and the
-    position is computed from the ranges kept by the robust fit.
+    In chi-square mode, a robust fit must confirm the exclusion. If the robust fit keeps a range of a pair, the pair is
+    not excluded: other satellites may be faulty. Where the fault remains unresolved, `RaimResult.faulty` is True, and
+    the position is computed from the ranges kept by the robust fit.
 
     Parameters
     ----------

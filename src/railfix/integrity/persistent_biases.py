@@ -63,7 +63,7 @@ class BiasLimits(NamedTuple):
 
 
 class PersistentBiases(NamedTuple):
-    """Positions of T epochs without the satellites that have persistent errors."""
+    """Positions of T epochs, computed without the satellites that have persistent errors."""
 
     fix: LineFix
     model: LinearModel  #: Linear model of the positions.

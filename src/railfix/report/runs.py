@@ -60,9 +60,9 @@ class ReportedRun:
     #: is also None if the filter was off.
     errors: pl.DataFrame | None
     filtered: pl.DataFrame | None
-    train: pl.DataFrame | None  #: Times, positions and sigmas of the filter along the track; None if it was off.
+    train: pl.DataFrame | None  #: Times, positions and sigmas of the filter; None if the filter was off.
     reference: str  #: Path of the reference; "" if there is none.
-    conventional: Path | None  #: Folder of another run whose conventional positions are shown; None for its own.
+    conventional: Path | None  #: Folder of another run whose conventional positions are shown; None for this run's own.
     track: Track | None  #: Track of the run; None if its files cannot be read.
     curve: Cn0Curve | None  #: C/N0 curve of the run; None if the run used no curve, or the curve cannot be read.
     notes: tuple[str, ...]  #: Notes of the report on the run, in addition to the notes of the run itself.

@@ -27,8 +27,8 @@ _SECOND: Final = np.timedelta64(1, "s")
 ENOUGH_TO_STOP: Final = 10
 #: Navigation records and sensor samples farther in time than this from a log are assumed to be of another day.
 ANOTHER_DAY: Final = np.timedelta64(24, "h")
-#: Sensors with samples only at events. They have no samples while the train is at rest or passes no balise or ground
-#: unit.
+#: Sensors with samples only at events. They have no samples while the train is at rest, or passes neither a balise nor
+#: a ground unit.
 _OF_EVENTS: Final = ("tachometer", "ranging", "balises")
 #: A navigation record is assumed to be usable at epochs at most this far from its reference time (BeiDou: 6 h,
 #: `gnss.orbits.prepared_records.VALIDITY_S`).

@@ -348,7 +348,7 @@ class MeasuredFeature:
 
     feature: Feature  #: Feature; its `arc_m` is a chainage.
     places_m: Floats  #: Chainage of the feature in each of the R runs in which it is also detected, shape (R,) [m].
-    map_m: float  #: Chainage of the feature in the map [m], NaN if the map lacks it.
+    map_m: float  #: Chainage of the feature in the map [m], NaN if the map lacks the feature.
 
 
 def find_features(runs: Sequence[pl.DataFrame], of_map: Sequence[Feature] = ()) -> list[MeasuredFeature]:

@@ -162,7 +162,7 @@ class ParquetFile:
         self._thread.start()
 
     def append(self, table: pl.DataFrame) -> None:
-        """Queue rows for writing. Raise SchemaError for other columns, and any error in the writing of earlier rows."""
+        """Queue rows for writing. Raise SchemaError if their columns differ, and any error in writing earlier rows."""
         from polars.exceptions import SchemaError
 
         if table.schema != self._schema:

@@ -31,7 +31,7 @@ from railfix.track.trajectory import Trajectory
 
 
 def with_measured_priors(config: Config) -> Config:
-    """Return settings, with fault priors and sections without a protection level taken from their error model.
+    """Return settings with the fault priors, and the sections without a protection level, of their error model.
 
     The settings remain unchanged if they have no error model, if they specify a fault prior, or if the error model has
     no bounds of fault priors. If the settings specify sections without a protection level, they are kept.
@@ -124,7 +124,7 @@ def parse_position(text: str, option: str) -> Floats:
 
 
 class BaseLog:
-    """Log of a base station. Without a `place` (LAT,LON,HEIGHT), its position is taken from its header.
+    """Log of a base station. Without a `place` (LAT,LON,HEIGHT), the station's position is from the log's header.
 
     Raise InputFileError if the log has no epoch, or if neither `place` nor the header states the position.
     """

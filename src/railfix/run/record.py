@@ -43,8 +43,8 @@ NO_FIGURES: Final = {"along_sigma_m": None, "chainage_m": None, "protection_leve
 def compute_figures(folder: OutputFolder, tally: Tally, config: Config) -> dict[str, dict[str, Any]]:
     """Return statistics of each antenna, computed from the written tables. Lengths are in metres.
 
-    There are statistics of the sigma along the line, the chainage, the finite protection levels (with epochs by
-    status), and the filter (with epochs by status, and levels within each limit of `WITHIN_M`). Absent ones are None.
+    The statistics are of the sigma along the line, the chainage, the finite protection levels (with epochs by status),
+    and the filter (with epochs by status, and levels within each limit of `WITHIN_M`). Absent statistics are None.
     """
     return {
         name: {
@@ -355,7 +355,7 @@ def _epochs_table(antennas: Mapping[str, Facts], basis: str, caption: str) -> Ta
 
 
 def _rows_of_few(antennas: Sequence[Facts]) -> Iterator[list[str]]:
-    """Yield a row per rejection reason: the epochs with too few satellites because of it, and because of it alone."""
+    """Yield a row per rejection reason: `AntennaTally.short_first` and `AntennaTally.short_only` of each antenna."""
     first = [Counter(facts.get("too_few_satellites_by_first_reason") or {}) for facts in antennas]
     alone = [Counter(facts.get("too_few_satellites_by_one_reason_alone") or {}) for facts in antennas]
     for reason in dict.fromkeys(name for counts in first for name, _ in counts.most_common()):

@@ -35,7 +35,7 @@ from railfix.track.network_route import find_route, left_out_note
 
 #: Interval of the matched positions [s].
 _INTERVAL_S: Final = 1.0
-#: A track of the route is near a position on it, or at most this far beyond its ends along the route [m].
+#: A track of the route is near a position that is on the track, or beyond an end of the track by less than this [m].
 _REACH_M: Final = 50.0
 #: Assumed bound on the relative difference between lengths in plan and lengths along the line. `_REACH_M` is increased
 #: by this fraction of the route length.

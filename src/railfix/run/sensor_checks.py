@@ -170,7 +170,7 @@ def _radar_speeds(radar: RadarSpeeds, time: Datetimes) -> Floats:
 
 
 def _means(time: Datetimes, values: Floats, middle: Datetimes) -> Floats:
-    """Return the mean of the samples within one cell length of each instant; NaN where samples do not cover it."""
+    """Return the mean of samples within a cell length of each instant; NaN where samples do not cover this interval."""
     half = timedelta(np.array([_CELL_S]))
     begin, end = middle - half, middle + half
     first, last = np.searchsorted(time, begin), np.searchsorted(time, end)
@@ -221,7 +221,7 @@ _SCALE: Final = 0.01
 _LAG_S: Final = 0.3
 #: Relative scale error that wheel wear cannot cause; above it, the note suggests another number of pulses per turn.
 _OTHER_TEETH: Final = 0.1
-#: A range is compared with the satellite positions before and after it if they are at most this far apart [s].
+#: A range is compared with the satellite positions before and after it if these are at most this far apart [s].
 _BETWEEN_S: Final = 3.0
 #: Ranges are not compared if the train moves by at most this between the two satellite positions [m].
 _MOVED_M: Final = 1.0
@@ -229,7 +229,7 @@ _MOVED_M: Final = 1.0
 _FAR_M: Final = 500.0
 #: Ground units are taken as ahead or behind if the cosine of their angle to the track exceeds this in magnitude.
 _AHEAD: Final = 0.7
-#: Ranges to units ahead (or behind) are compared only if there are at least this number of them.
+#: Ranges to units ahead (or behind) are compared only if the number of these ranges is at least this.
 _LEAST_RANGES: Final = 10
 #: Offsets of ranges from satellite positions are reported if they exceed this [m]: twice the assumed code error that
 #: lasts for minutes.

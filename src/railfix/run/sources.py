@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 #: A track that is shorter than this is rejected [m].
 _SHORTEST_M: Final = 1.0
-#: Name of the file in the results folder that has the run's track, if the track differs from the input files.
+#: File name of the run's track in the results folder. The file exists only if the track differs from the input files.
 TRACK_FILE: Final = "track.csv"
 
 

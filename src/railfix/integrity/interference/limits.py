@@ -97,7 +97,7 @@ class InterferenceLimits(Settings):
     drift_jump_mps: float = Field(default=10.0, gt=0)  #: Jumps of the clock drift by more than this count as a sign.
     speed_jump_mps: float = Field(default=5.0, gt=0)  #: Jumps of the 3-D velocity by more than this count as a sign.
     position_jump_m: float = Field(default=30.0, gt=0)  #: Jumps of the 3-D position by more than this count as a sign.
-    #: Distances of the 3-D position from the line below this are no sign. A yard is about 100 m wide.
+    #: 3-D positions closer to the line than this are no sign. A yard is about 100 m wide.
     off_map_m: float = Field(default=100.0, gt=0)
     #: Estimated time-tag errors below this are no sign. For correct time tags, the estimated error reaches 0.05 s in
     #: towns, and 0.13 s with a phone and seven satellites.
@@ -127,8 +127,8 @@ class InterferenceLimits(Settings):
     #: not detected yet. With "on", the protection level is two to four times as large.
     wheel_level: Literal["on", "off"] = "off"
     #: With `wheel_level` on, the level is at least the GNSS-wheel distance difference plus this number of combined
-    #: sigmas of wheel distance and position at the window start. The default assumes that spoofing began within the
-    #: window with a probability of 1e-7, and that the integrity risk is 1e-9.
+    #: sigmas of the wheel distance and of the position at the window start. The default assumes that spoofing began
+    #: within the window with a probability of 1e-7, and that the integrity risk is 1e-9.
     wheel_level_sigmas: float = Field(default=2.33, ge=0)
     #: Relative standard deviation of the wheel circumference before its estimation from positions.
     wheel_scale: float = Field(default=0.01, gt=0)

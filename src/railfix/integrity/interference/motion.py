@@ -168,7 +168,7 @@ def _length(covariance: Floats) -> Floats:
 
 
 def _before(fixes: Fix, start: Fix, good: Masks) -> tuple[Fix, Fix]:
-    """Return the last `good` fix before each epoch, and the last `good` fix of the chunk; `start` if there is none."""
+    """Return the last fix marked in `good` before each epoch and at the chunk's end; `start` where there is none."""
     if len(good) == 1:
         return start, fixes if good[0] else start
     time, *numbers = (np.concatenate([a, b]) for a, b in zip(start, fixes, strict=True))

@@ -55,7 +55,7 @@ class _TagFit(NamedTuple):
     error_s: Floats  # (T,), positive for late tags
     sigma_s: Floats  # (T,)
     place_ecef_m: Floats  # (T, 3)
-    residual: Floats  # (T, K + 2), absolute, normalised; the last two are of the line constraint
+    residual: Floats  # (T, K + 2), absolute, normalised; the last two columns are of the line constraint
 
 
 def fit_time_tags(inputs: MotionInputs) -> tuple[Floats, Floats]:
@@ -84,7 +84,7 @@ def _explains_more(inputs: MotionInputs, with_error: Floats, without: Floats) ->
     rows, clocks = _with_line(every, True), (clock_columns(inputs) * every[..., None]).any(axis=1).sum(axis=1)
     # without redundancy, the accepted ranges fit exactly, and the rejected ranges count as faulty
     without = np.where(np.isnan(without), np.where(_with_line(inputs.named, False), np.inf, 0.0), without)
-    # noise scale of the fit with a time-tag error, at most that of the receiver and at least 1
+    # noise scale of the fit with a time-tag error, limited to the range from 1 to the receiver's noise scale
     noise = np.maximum(np.minimum(masked_median(with_error, rows) / _NORMAL_MEDIAN, inputs.noise_scale), 1.0)[:, None]
     before, after = (np.minimum(np.where(rows, each / noise, 0.0), _AGREES) ** 2 for each in (without, with_error))
     freedom = (rows & (after < _AGREES**2)).sum(axis=1) - 4 - clocks

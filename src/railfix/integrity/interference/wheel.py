@@ -30,8 +30,7 @@ class WheelSamples(RowArrays):
     arc_m: Floats = field(default_factory=lambda: np.empty(0))  #: GNSS position along the line.
     sigma_m: Floats = field(default_factory=lambda: np.empty(0))  #: Standard deviation of the GNSS position.
     distance_m: Floats = field(default_factory=lambda: np.empty(0))  #: Wheel distance since the start of the run.
-    #: Largest distance since the start that may be missing from `distance_m`, because tachometers have no output at low
-    #: speed.
+    #: Upper bound on the distance that is missing from `distance_m`, because tachometers have no output at low speed.
     doubt_m: Floats = field(default_factory=lambda: np.empty(0))
     #: Index of the part of the run. Within a part, the wheel data have neither slip nor a gap.
     part: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
@@ -46,7 +45,7 @@ class WheelState:
     time: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))  #: Time of the last epoch.
     distance_m: float = 0.0  #: `WheelSamples.distance_m` at the last epoch.
     doubt_m: float = 0.0  #: `WheelSamples.doubt_m` at the last epoch.
-    speed_mps: float = float("nan")  #: Last known wheel speed; NaN if none.
+    speed_mps: float = float("nan")  #: Last known wheel speed; NaN if no speed is known yet.
     part: int = 0  #: Number of the current part.
     second: int = -1  #: GPS second of the last epoch; -1 before the first epoch.
     held: HeldState = field(default_factory=HeldState)
@@ -62,7 +61,8 @@ class WheelSigns:
     #: GNSS distance minus scaled wheel distance over the window, shape (T,); NaN where not compared.
     difference_m: Floats
     #: Bound of the position error caused by spoofing that began within the window, shape (T,): absolute difference plus
-    #: `wheel_level_sigmas` times the combined standard deviation of wheel distance and position at the window start.
+    #: `wheel_level_sigmas` times the combined standard deviation of the wheel distance and of the position at the
+    #: window start.
     bound_m: Floats
     #: True where the difference has exceeded its limits for `hold_s`, or did so within the release time; shape (T,).
     parted: Masks

@@ -44,8 +44,8 @@ class Forms(NamedTuple):
     def radius_m(self, risk: float) -> Floats:
         """Return the search radius of each hypothesis, shape (T, K); 0 for a hypothesis whose prior is 0.
 
-        The true position is outside the radii with at most 1 % of the risk, divided equally among hypotheses. A radius
-        is at most 5 km.
+        The probability of a true position outside the radii is at most 1 % of the risk, divided equally among
+        hypotheses. A radius is at most 5 km.
         """
         possible = self.prior > 0
         each = _NEGLIGIBLE * risk / np.maximum(np.count_nonzero(possible, axis=1, keepdims=True), 1)
@@ -71,9 +71,9 @@ def places_beyond_the_level(
 
     Under a hypothesis J, let the sum of squared residuals of a position exceed its minimum by x noise variances. This
     position is the true position with a probability of at most ``Q(sqrt(x))``. For each hypothesis, this probability is
-    computed for the position beyond the protection level that fits best, and multiplied by the prior of J. The result
-    is True where the sum over the hypotheses exceeds the risk of a sample. A `scale` below 1 counts as 1. `sides`,
-    shape (T, S, M), marks the low satellites of each side of the track.
+    computed for the best-fitting position beyond the protection level, and multiplied by the prior of J. The result is
+    True where the sum over the hypotheses exceeds the risk of a sample. A `scale` below 1 counts as 1. `sides`, shape
+    (T, S, M), marks the low satellites of each side of the track.
     """
     result = np.zeros(len(arc_m), dtype=bool)
     rows = (np.isfinite(level_m) & np.isfinite(arc_m) & np.isfinite(model.wsse)).nonzero()[0]

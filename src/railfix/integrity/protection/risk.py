@@ -74,7 +74,7 @@ class RiskBudget(Settings):
     #: Fraction of the risk for faults that no hypothesis covers. If these faults are more probable, more faults become
     #: hypotheses, with up to four satellites and three shared faults (constellation, side, map) at the same time.
     unchecked_share: float = Field(default=0.3, gt=0, lt=1)
-    #: Fraction of the risk for epochs with one excluded satellite; epochs with two have an equal fraction.
+    #: Fraction of the risk for epochs with one excluded satellite; the fraction for epochs with two is equal.
     exclusion_share: float = Field(default=0.1, ge=0, lt=0.5)
     #: Probability per epoch that noise alone makes the solution separations exceed their thresholds; 1e-3 in P4.
     false_alarm: float = Field(default=1e-3, gt=0, lt=1)
@@ -95,7 +95,7 @@ class RiskBudget(Settings):
     side_elevation_deg: float = Field(default=45.0, gt=0, le=90.0)
     #: Sets of satellites that may be faulty together. With "beside", there are two sets: the low satellites left and
     #: right of the track. With "all", as in the filter, the satellites ahead and behind are two more sets. Levels are
-    #: then up to three times as large, because single-epoch geometry along the track is weak without one of these sets.
+    #: up to three times as large, because single-epoch geometry along the track is weak without one set's satellites.
     late_sides: Literal["beside", "all"] = "beside"
     #: Whether the priors were measured on this line (``railfix error-model``). If they are assumed, every output calls
     #: the levels indicative, and no hourly risk is claimed. "measured" requires `local_prior` and `side_prior`.
@@ -206,9 +206,9 @@ class Allocation:
     shared: tuple[Shared, ...]  # B sets of shared faults, of which the first is empty
     members: Masks  # (T, B, M) satellites affected by each set of shared faults
     shared_prior: Floats  # (T, B) probability of each set of shared faults; 0 if too few of its satellites are used
-    order: Indices  # (T, B) largest number of satellites that are faulty in addition to each set; -1: no hypothesis
+    order: Indices  # (T, B) largest number of faulty satellites in addition to each set; -1 if the set is no hypothesis
     beyond: Floats  # (T,) probability of the classes without a hypothesis
-    fault_free: Floats  # (T,) risk allocated to no fault
+    fault_free: Floats  # (T,) risk allocated to the fault-free case
     one: Floats  # (T,) risk allocated to one fault
     two: Floats  # (T,) risk allocated to two faults
     more: Floats  # (T,) risk allocated to three or more faults; 0 where no such hypothesis exists
@@ -338,7 +338,7 @@ class _Classes:
     """Hypothesis classes of T epochs: B sets of shared faults, each with 0 to `MOST_TOGETHER` single satellites."""
 
     each: Floats  # (T, B) prior of each set of shared faults
-    within: Masks  # (B, B) true where the second set is the first set without one of its faults
+    within: Masks  # (B, B) true where the column's set is the row's set without one of its faults
     sums: Floats  # (T, MOST_TOGETHER + 2) `set_sums` of the satellite priors
     further: Floats  # (T,) probability of more than `_MOST_SHARED` shared faults
     least: Sequence[int]  # length B, smallest allowed value of `Allocation.order`

@@ -251,7 +251,7 @@ class _Names(NamedTuple):
     """Hypotheses of a block, the risk of each part, and the names of the faults."""
 
     asked: Asked
-    share: Floats  # (T, 4) risk for no fault, one, two, and more faults
+    share: Floats  # (T, 4) risk for zero, one, two, and more faults
     letters: Strings  # letters of constellations with a single-fault hypothesis, numbered after the n channels
     pairs: Indices  # (K, 2) pairs of channels; the last entry is (-1, -1)
 

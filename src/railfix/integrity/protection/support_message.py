@@ -91,7 +91,7 @@ class IntegritySupport(Settings):
 
 
 def read_integrity_support(path: FilePath) -> IntegritySupport:
-    """Read an integrity support message from a TOML file; raise InputFileError if it is not one."""
+    """Read an integrity support message from a TOML file; raise InputFileError if the file has other content."""
     values = read_toml(path, what="an integrity support message")
     if values.get("format") != FORMAT:
         raise InputFileError(path, f"is not an integrity support message: format = '{FORMAT}' was expected")

@@ -1,10 +1,10 @@
 """Linear model of the ranges for RAIM, on the line and in space.
 
-P4 tests the residuals of ``y = H x + v``. Here, every range is divided by its sigma. The receiver clocks are
-eliminated, and the lateral and vertical map errors, which have a prior. The residual projector is ``S = I - R K R^T - B
-Q B^T``. R has 1/sigma in the column of the satellite's clock, K is the clock covariance at a known position, B is the
-design without the clocks, and Q is the position covariance. The residuals are ``nu = S y``, and ``WSSE = y^T S y`` is
-chi-square distributed with `LinearModel.freedom` degrees of freedom.
+P4 tests the residuals of ``y = H x + v``. Here, every range is divided by its sigma. The receiver clocks and the
+lateral and vertical map errors are eliminated; the map errors have a prior. The residual projector is ``S = I - R K R^T
+- B Q B^T``. R has 1/sigma in the column of the satellite's clock, K is the clock covariance at a known position, B is
+the design without the clocks, and Q is the position covariance. The residuals are ``nu = S y``, and ``WSSE = y^T S y``
+is chi-square distributed with `LinearModel.freedom` degrees of freedom.
 """
 
 from __future__ import annotations

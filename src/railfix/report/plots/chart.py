@@ -236,7 +236,7 @@ def since(table: pl.DataFrame, start: np.datetime64) -> Floats:
 
 
 def nice_step(rough: float) -> float:
-    """Return the smallest number of the form 1, 2 or 5 times a power of ten that is not below `rough`."""
+    """Return the smallest number that is 1, 2 or 5 times a power of ten, and not less than `rough`."""
     power = 10.0 ** np.floor(np.log10(max(rough, 1e-9)))
     return float(next(power * k for k in (1.0, 2.0, 5.0, 10.0) if power * k >= rough * (1.0 - 1e-9)))
 

@@ -63,9 +63,9 @@ def plan(
 ) -> Chart:
     """Return a plan of the line and the positions of one antenna, with marks of the kilometrage (P1 figure 6).
 
-    Positions are coloured by the first of these that is given: `error_m`, shape (rows,), `level_m`, shape (rows,),
-    status. If `filtered` is given, filter positions are drawn at epochs without a single-epoch position. If `track` is
-    not given, the line is drawn through the positions. `tunnels_m` has the first and last chainage of each tunnel.
+    Positions are coloured by `error_m`, otherwise by `level_m`, both of shape (rows,); if neither is given, by status.
+    If `filtered` is given, filter positions are drawn at epochs without a single-epoch position. If `track` is not
+    given, the line is drawn through the positions. `tunnels_m` has the first and last chainage of each tunnel.
     `background` has lines that are drawn below, each as longitude and latitude of shape (P, 2) [deg]. The chart is
     empty if there is no position.
     """
@@ -143,7 +143,7 @@ class LocalFrame:
 
     @classmethod
     def at(cls, latitude_deg: float, longitude_deg: float) -> LocalFrame:
-        """Return the frame at a point on the ellipsoid, in degrees."""
+        """Return the frame at a point on the ellipsoid, given by latitude and longitude in degrees."""
         origin, axes = ecef_from_geodetic(latitude_deg, longitude_deg, 0.0), enu_axes(latitude_deg, longitude_deg)
         return cls(
             origin_ecef_m=origin, axes=axes, latitude_deg=latitude_deg, longitude_deg=longitude_deg, height_m=0.0

@@ -295,7 +295,7 @@ def plot_survey(surveyed: Surveyed, path: str | PathLike[str]) -> None:
 
 
 def plot_track_decision(decision: TrackDecision, path: str | PathLike[str], *, risk: float) -> None:
-    """Write a picture over time: probability of each track, and, with the allowed risk, the complement to 1."""
+    """Write a picture over time: probability of each track, its complement to 1, and the allowed risk."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(10, 6), dpi=120)

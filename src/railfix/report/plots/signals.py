@@ -52,7 +52,7 @@ def cn0_over_elevation(
 ) -> list[Chart]:
     """Return a chart of C/N0 over elevation for each constellation and signal (P1 figure 3).
 
-    The chart has the mean, the thresholds of the screen `limits`, and the elevation mask. The mean is taken from
+    The chart has the mean, the thresholds of the C/N0 screen (`limits`), and the elevation mask. The mean is taken from
     `curve` if `curve` has the signal; otherwise it is computed from the observations.
     """
     taken = observations.lazy().filter(
