@@ -47,9 +47,7 @@ def service(
     ] = None,
     picture: Annotated[Path | None, typer.Option(metavar="FILE", help="Plot of the table (.png or .svg).")] = None,
     page: Annotated[Path | None, typer.Option(metavar="FILE.html", help="Page to write, with zoomable charts.")] = None,
-    stretch: Annotated[
-        float, typer.Option(metavar="M", help="Length of the stretches into which the line is divided.")
-    ] = 100.0,
+    stretch: Annotated[float, typer.Option(metavar="M", help="Length of each stretch of the line.")] = 100.0,
     limit: Annotated[float, typer.Option(metavar="M", help="Alarm limit for the protection level.")] = 20.0,
     overwrite: OverwriteOption = False,
 ) -> None:

@@ -194,7 +194,7 @@ BENCHMARK_COLUMNS: Final[dict[str, str]] = {
     **{name: FIGURE_COLUMNS[name] for name in _OF_FIGURES},
     "time_to_first_s": "time from the first epoch with observations to the first position",
     "over_level": "number of errors above a usable protection level (no alarm, and a status with a bounded error)",
-    "over_level_alarm": "number of errors above the protection level where an alarm or the status makes the level unusable",
+    "over_level_alarm": "number of errors above the protection level where the level is unusable (alarm or status)",
     **{name: f"{STANFORD_COLUMNS[name]} (levels `usable`, alarm limit of the run)" for name in _OF_STANFORD},
     "error": "reason for a missing result",
 }
