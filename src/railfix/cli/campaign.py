@@ -114,8 +114,8 @@ def campaign(
 
 
 def show_progress(*, done: int, kept: int, failed: int, total: int, left_s: float) -> None:
-    """Print the number of finished runs and the remaining time on standard error; `kept` runs were finished by an
-    earlier command.
+    """Print the number of finished runs and the remaining time on standard error; `kept` is the number of runs that an
+    earlier command finished.
     """
     minutes, seconds = divmod(round(left_s), 60)
     before = f" ({kept} of earlier calls)" if kept else ""

@@ -113,7 +113,7 @@ class LazyCommands(Commands):
     """Group that imports a command's module only when the command is called; the help is made from `summaries`."""
 
     summaries: ClassVar[Mapping[str, str]] = {}
-    #: Module of each command that is in a module with a different name, by name of the command.
+    #: Module by name of the command, for the commands whose module has a different name.
     modules: ClassVar[Mapping[str, str]] = {}
 
     def list_commands(self, ctx: Any) -> list[str]:

@@ -238,10 +238,10 @@ def error_model(
     """Model the errors that corrected pseudoranges have on a line because of multipath and receiver noise.
 
     The positions of each RUN are computed again with its settings. The error of a pseudorange is the pseudorange minus
-    the receiver clock and the distance between satellite and reference position. With `--base`, the error of the same
-    satellite at a nearby reference station is also subtracted. Without `--base`, the model includes the orbit, clock
-    and atmospheric errors of the recorded days; its standard deviations are then larger, and it is valid only for days
-    with similar errors.
+    the sum of the receiver clock bias and the distance between satellite and reference position. With `--base`, the
+    error of the same satellite at a nearby reference station is also subtracted. Without `--base`, the model includes
+    the orbit, clock and atmospheric errors of the recorded days; its standard deviations are then larger, and it is
+    valid only for days with similar errors.
 
     The file has the bias, the standard deviation and a Gaussian overbound for every bin of elevation, C/N0, and azimuth
     relative to the front of the car. Bias, standard deviation and overbound are stated before and after the screens.

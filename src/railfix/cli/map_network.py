@@ -257,8 +257,8 @@ def match_command(
 ) -> None:
     """Match positions to the tracks of a network.
 
-    For each position, the output has the most probable track, the probability of this track, the chainage on it, and
-    the second most probable track.
+    For each position, the output has the most probable track, the probability of this track, the chainage on this
+    track, and the second most probable track.
 
     Rows that have no position but are between rows with known positions are filled along the shortest route;
     `filled_bound_m` bounds the error of a filled row. The positions are transformed to the reference frame of the map

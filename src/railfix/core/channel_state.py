@@ -29,7 +29,7 @@ class JoinedChannels:
     places: tuple[Indices, ...]
 
     def arrange(self, values: NDArray[Value], fill: Any, state: int = 0) -> NDArray[Value]:
-        """Arrange a state's values (channels on the last axis) for all U channels; absent values are `fill`."""
+        """Arrange a state's values (channels on the last axis) for all U channels; `fill` where the state has none."""
         place = self.places[state]
         known = place >= 0
         out: NDArray[Value] = np.full((*values.shape[:-1], len(place)), fill, dtype=values.dtype)

@@ -52,10 +52,10 @@ ROTATION_GRADIENT: Final = 1.1e-5
 FAN_OUT: Final = 8
 #: The error of a range is estimated only if the redundancy number of the range is at least this value.
 LEAST_REDUNDANCY: Final = 1e-9
-#: Cosine of 6 deg: largest angle, seen from the position, between the tangent and a point of the line to which the
-#: linear model of the protection level applies.
+#: Cosine of 6 deg. The linear model of the protection level does not apply to points of the line whose direction from
+#: the position makes a larger angle with the tangent.
 ALONG: Final = 0.9945
-#: The section search approximates the line by its tangent within this distance, or less if the line bends earlier [m].
+#: The section search approximates the line by its tangent up to the next bend, but at most over this distance [m].
 CLEAR_M: Final = 200.0
 #: A point counts as lying on a tangent if its distance from the tangent is at most this value [m].
 ON_TANGENT_M: Final = 1e-3

@@ -105,7 +105,7 @@ class ReferenceData:
     """Measurements from which a reference is built."""
 
     logs: Mapping[str, PositionLog]  #: Position logs by antenna ("front", "rear").
-    trajectories: Mapping[str, Trajectory]  #: Trajectories of the antennas with positions or Dopplers.
+    trajectories: Mapping[str, Trajectory]  #: Trajectory of each antenna that has positions or Dopplers.
     dopplers: Mapping[str, Dopplers] = field(default_factory=dict)  #: Dopplers by antenna; may be empty.
     pulses: Pulses | None = None
     acceleration: Acceleration | None = None
@@ -282,7 +282,7 @@ class _ReferenceBuilder:
     def _travel(
         self, time: Datetimes, speeds: SolvedSpeeds, wheel: Wheel | None, fixes: Fixes, settings: ReferenceSettings
     ) -> tuple[Floats, Floats]:
-        """Return the distance travelled up to each time, and its variance, from the wheel (if any) or Dopplers."""
+        """Return the distance travelled up to each time and its variance, from the wheel or else from Dopplers."""
         joined = self._join(speeds)
         if wheel is not None:
             way = wheel.distance_m(time, self._hint(time, joined, fixes))

@@ -49,14 +49,14 @@ class ReferenceSettings(Settings):
 
     #: Fixes with a smaller ratio of the ambiguity test are rejected, if the log has ratios (RTKLIB's default is 3).
     ratio: float = _limit("Fixes with a smaller ambiguity ratio (if logged) are rejected.", 3.0, "RATIO", "--ratio")
-    #: Fixes are rejected if the antennas' distance differs from the vehicle's by more than this value (P2 3.3: 5 cm).
+    #: Pairs of fixes are rejected if their distance differs from the antenna spacing by more than this (P2 3.3: 5 cm).
     spacing_m: float = _limit(
         "Tolerance of the measured distance between the antennas; other fixes are rejected.", 0.05, "M", "--spacing"
     )
     #: Whether a fix of one antenna is rejected if the other antenna's log has no fix at that time.
     unpaired: Literal["reject", "keep"] = "reject"
     #: Fixes at a larger lateral distance from the antenna's trajectory are rejected. The value is about three standard
-    #: deviations of the map (P1 4.1(3)).
+    #: deviations of the map error (P1 4.1(3)).
     lateral_m: float = _limit("Fixes at a larger lateral distance from the path are rejected.", 1.0, "M", "--lateral")
     #: Fixes at a larger distance above or below the antenna's trajectory are rejected.
     height_m: float = _limit("Fixes farther above or below the antenna's path are rejected.", 2.0, "M", "--height")
@@ -96,7 +96,7 @@ class ReferenceSettings(Settings):
 _PAIR_NS: Final = 5_000_000
 #: Number of earlier sequences of agreeing fixes that `_best_chain` considers as predecessors of a sequence.
 _LOOK_BACK: Final = 60
-#: This number of standard deviations of the difference is added to the limit `ReferenceSettings.travel_m`.
+#: Noise term of the limit `ReferenceSettings.travel_m`: this number of standard deviations of the compared difference.
 _TRAVEL_SIGMAS: Final = 3.0
 _FIX: Final = 1
 

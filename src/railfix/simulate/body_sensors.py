@@ -35,9 +35,9 @@ _WHEEL, _SLIPS, _TEETH, _MISCOUNT = 20, 21, 30, 31
 
 
 def wheel_slips(simulation: Simulation, settings: TachometerSettings) -> list[SlipInterval]:
-    """Return the slips and slides of the run in order of time, both specified in the settings and drawn at random.
+    """Return the slips and slides of the run in order of time, those of the settings and those drawn at random.
 
-    A drawn slip or slide that overlaps another is left out.
+    A drawn slip or slide is left out if it overlaps another slip or slide.
     """
     scenario = simulation.scenario
     rng = np.random.default_rng([scenario.seed, _SLIPS])
@@ -70,7 +70,7 @@ def _draw(motion: Motion, duration_s: float, drawn: DrawnSlips, rng: np.random.G
 
 
 def slip_ratio(slips: list[SlipInterval], time_s: Floats) -> Floats:
-    """Return (wheel speed - train speed) / train speed at times [s]; 0 without a slip."""
+    """Return (wheel speed - train speed) / train speed at times [s]; 0 at times without a slip or slide."""
     ratio = np.zeros(np.shape(time_s))
     for slip in slips:
         part = (time_s - slip.start_s) / (slip.end_s - slip.start_s)
@@ -251,7 +251,7 @@ def inertial_table(simulation: Simulation, settings: InertialSettings) -> pl.Dat
 
 
 def _vibration(simulation: Simulation, settings: InertialSettings, time_s: Floats) -> Floats | float:
-    """Return the vibration of the six axes at times, shape (n, 6), or 0 where both sigmas are 0."""
+    """Return the vibration of the six axes at times, shape (n, 6), or the number 0 if both sigmas are 0."""
     sigmas = np.repeat([settings.vibration_sigma_mps2, settings.vibration_sigma_radps], 3)
     if not sigmas.any():
         return 0.0

@@ -118,7 +118,7 @@ _INAV_SOURCE: Final = 517
 
 @dataclass(frozen=True, kw_only=True)
 class _Orbit:
-    """Orbit of a satellite at the start of the run; angles [rad], node in the Earth-fixed frame of that instant."""
+    """Orbit of a satellite at the start of the run; angles [rad], node in the Earth-fixed frame at the start."""
 
     name: str
     semi_major_m: float
@@ -317,7 +317,7 @@ def newest_record(records: KeplerRecords, satellite: str, time: Datetimes) -> In
 
 
 def links(records: KeplerRecords, satellite: str, tag: Datetimes, late_s: Floats, receiver_ecef_m: Floats) -> Links:
-    """Return the geometry of the signals received from a satellite `late_s` before each of T time tags.
+    """Return the geometry of the signals that are received from a satellite at instants `late_s` before T time tags.
 
     The light-time equation is solved by iteration.
     """
@@ -348,7 +348,7 @@ def _solve_light_time(state: Callable[[Floats], Floats], flight_s: Floats, recei
 
 
 class SatelliteTable:
-    """States of satellites over a time span, from polynomials of degree 6 that are exact within 1e-6 m."""
+    """States of satellites over a time span, from polynomials of degree 6 that are accurate to 1e-6 m."""
 
     def __init__(
         self, records: KeplerRecords, satellites: Sequence[str], first: np.datetime64, last: np.datetime64

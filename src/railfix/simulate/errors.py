@@ -30,8 +30,8 @@ from railfix.simulate.settings import ErrorSettings, SatelliteErrorSettings, Sat
 _NODES_A_TIME: Final = 32  #: Number of interpolation nodes per correlation time.
 #: Minimum number of interpolation nodes before the start of the run.
 _BEFORE: Final = 3
-#: Errors are also drawn for these times before and after the run [s], because clock biases shift instants beyond the
-#: start and the end of the run.
+#: Errors are also drawn for the first of these durations before the run and for the second after the run [s], because
+#: clock biases shift instants beyond the start and the end of the run.
 _ROOM_S: Final = (0.1, 1.0)
 
 
@@ -43,9 +43,9 @@ def satellite_key(satellite: str) -> tuple[int, int]:
 
 
 class Interpolated:
-    """Functions of time, given at K evenly spaced nodes, shape (K, C); the interpolation has a continuous derivative.
+    """C functions of time, given by values (K, C) at K evenly spaced nodes; the interpolated slope is continuous.
 
-    `nodes_before` nodes precede the start of the run.
+    The function `nodes_before` returns the number of nodes before the start of the run.
     """
 
     def __init__(self, nodes: Floats, spacing_s: float) -> None:
@@ -85,7 +85,7 @@ def nodes_before(spacing_s: float) -> int:
 
 
 def node_count(duration_s: float, spacing_s: float) -> int:
-    """Return the number of nodes for a run of a given duration, with the margins before and after it."""
+    """Return the number of nodes for a run of a given duration, with the margins before and after the run."""
     return nodes_before(spacing_s) + int(np.ceil((duration_s + _ROOM_S[1]) / spacing_s)) + 4
 
 
@@ -111,7 +111,7 @@ class GaussMarkov(Interpolated):
 
 
 def _interpolate_sigma(rho: float) -> float:
-    """Return the RMS between nodes of an interpolated process whose standard deviation at the nodes is 1."""
+    """Return the RMS that an interpolated process has between nodes if its RMS at the nodes is 1."""
     u = (np.arange(200) + 0.5) / 200.0
     weight = 0.5 * np.stack(
         [-u + 2 * u**2 - u**3, 2 - 5 * u**2 + 3 * u**3, u + 4 * u**2 - 3 * u**3, -(u**2) + u**3], axis=-1
@@ -165,7 +165,7 @@ class RandomFunction:
         return cls(amplitude=sigma * float(np.sqrt(2.0 / _COSINES)), frequency=frequency, phase=phase)
 
     def at(self, x: ArrayLike) -> Floats:
-        """Return the values of the function at positions or times `x`, in the shape of `x`."""
+        """Return the values of the function at positions or times `x`, with the shape of `x`."""
         where = np.asarray(x, dtype=np.float64)
         if self.amplitude == 0.0:
             return np.zeros(where.shape)
@@ -203,7 +203,7 @@ class CommonErrors:
 
     @cached_property
     def active(self) -> bool:
-        """Whether the errors `path_m` or `ionosphere_m` can differ from 0."""
+        """Whether at least one of the errors `path_m` and `ionosphere_m` can differ from 0."""
         atmosphere = self._settings.ionosphere.vertical_sigma_m, self._settings.ionosphere.gradient_mm_per_km
         return any((*atmosphere, self._settings.troposphere.zenith_sigma_m, self._clocks, self._orbits))
 
@@ -327,7 +327,7 @@ class CommonErrors:
 
 
 def fault_m(faults: Sequence[SatelliteFault], time_s: Floats, satellites: Sequence[str]) -> tuple[Floats, Floats]:
-    """Return the range errors due to faults [m] and their rates [m/s], shapes (T, M), at times from the start [s]."""
+    """Return the range errors due to faults [m] and the rates of these errors [m/s] at times from the start, (T, M)."""
     names = np.asarray(satellites)
     added, rate = np.zeros((2, len(time_s), len(names)))
     for fault in faults:

@@ -78,7 +78,7 @@ class Terrain(ScenarioSettings):
     #: Range of the lengths of curves, excluding their transitions.
     curve_m: Annotated[Between, at_least(1.0)] = (100.0, 500.0)
     radius_m: Annotated[Between, at_least(100.0)] = (400.0, 1600.0)  #: Range of the radii of curves.
-    permille: float = Field(default=10.0, ge=0.0, le=35.0)  #: Gradients are drawn up to this, rising or falling.
+    permille: float = Field(default=10.0, ge=0.0, le=35.0)  #: Largest magnitude of the drawn gradients.
     #: Range of the distance between two changes of gradient.
     gradient_m: Annotated[Between, at_least(200.0)] = (400.0, 1500.0)
 
@@ -225,7 +225,7 @@ def knots_of_elements(elements: Sequence[Element], gradients: Sequence[Gradient]
 def _vertical(gradients: Sequence[Gradient], length_m: float) -> tuple[Floats, Floats]:
     """Return the chainages of the ends of the vertical curves, and the gradients at these ends.
 
-    Raise SettingsError if a vertical curve overlaps another or an end of the line.
+    Raise SettingsError if a vertical curve overlaps the previous vertical curve or extends beyond an end of the line.
     """
     places, values, reached, current = [0.0], [0.0], 0.0, 0.0
     for k, item in enumerate(gradients):
@@ -322,7 +322,7 @@ class FileLine:
     """Line through the V points of a track file."""
 
     track: Track  #: Points of the file that belong to the line.
-    point_m: Floats  #: Chainage of these points along the curve, shape (V,).
+    point_m: Floats  #: Chainage of each point along the curve, shape (V,).
     curve: CubicHermiteSpline[np.float64]  #: ECEF position [m] of the line as a function of chainage [m].
     knots: Knots
 

@@ -102,7 +102,7 @@ def _breakpoints(start_s: Floats, duration_s: float) -> Floats:
 
 
 def _acceleration_change(motion: Motion, time_s: Floats, duration_s: float) -> Floats:
-    """Return the acceleration just after breakpoints minus the acceleration `duration_s` earlier [m/s^2]."""
+    """Return the acceleration just after breakpoints minus the acceleration earlier by `duration_s` [m/s^2]."""
     after = time_s + 1e-9
     return np.asarray(motion.acceleration_at(after) - motion.acceleration_at(after - duration_s))
 

@@ -108,8 +108,7 @@ class TrackingNoise:
         self._settings = settings
         self._wait = int(np.ceil(settings.reacquisition_s / interval_s - 1e-9))
         self._salt = np.random.default_rng(list(key)).integers(0, 2**63, channels, dtype=np.uint64)
-        # Epochs since the last epoch at which the signal was not trackable; before the start, the signal is assumed
-        # trackable.
+        # Number of epochs since the signal was last not trackable; before the start, the signal is assumed trackable.
         self._since = np.full(channels, self._wait + 1, dtype=np.int64)
         self._seen = np.zeros(channels, dtype=np.bool_)
         self._present = np.zeros(channels, dtype=np.bool_)

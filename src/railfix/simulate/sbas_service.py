@@ -69,14 +69,14 @@ def mask(second: int, numbers: Collection[int], iodp: int = 0) -> Bytes:
 def fast(
     second: int, prc: Sequence[float], udrei: Sequence[int], *, kind: int = 2, iodf: int = 0, iodp: int = 0
 ) -> Bytes:
-    """Return a message of fast corrections [m] with UDREI, of type 0 or 2 to 5; remaining slots are not monitored."""
+    """Return a message of fast corrections [m] with UDREI, of type 0 or 2 to 5; other slots: "not monitored"."""
     values = [round(v / STEP_M) for v in prc] + [0] * (13 - len(prc))
     grades = list(udrei) + [NOT_MONITORED] * (13 - len(udrei))
     return message(kind, second, (iodf, 2), (iodp, 2), *((v, 12) for v in values), *((g, 4) for g in grades))
 
 
 def integrity(second: int, udrei: Sequence[int], iodf: Sequence[int] = (0, 0, 0, 0)) -> Bytes:
-    """Return a type 6 message, integrity, with the UDREI of the first slots; the remaining slots are not monitored."""
+    """Return a type 6 message, integrity, with the UDREI of the first slots; other slots: "not monitored"."""
     grades = list(udrei) + [NOT_MONITORED] * (51 - len(udrei))
     return message(6, second, *((i, 2) for i in iodf), *((g, 4) for g in grades))
 
@@ -136,7 +136,7 @@ def grid_mask(second: int, band: int, bits: Collection[int], iodi: int = 0, band
 def grid_delay(
     second: int, band: int, block: int, delay: Sequence[float], givei: Sequence[int], iodi: int = 0
 ) -> Bytes:
-    """Return a type 26 message, vertical grid delays [m] with GIVEI; remaining points are not monitored.
+    """Return a type 26 message, vertical grid delays [m] with GIVEI; other points of the block: "not monitored".
 
     A delay of 63.875 m means "do not use".
     """
@@ -146,11 +146,11 @@ def grid_delay(
     return message(26, second, (band, 4), (block, 4), *pairs, (iodi, 2))
 
 
-#: Contents of one message: slots in types 2 to 5, satellites in type 25, grid points in type 26.
+#: Largest number of slots in message types 2 to 5, of satellites in type 25, and of grid points in type 26.
 _FAST, _LONG_TERM, _DELAYS = 13, 4, 15
-#: Number of slots in message type 24. If no more slots remain, the last message of fast corrections has type 24.
+#: Number of slots in message type 24. If at most this many slots remain, the last fast corrections are sent in type 24.
 _MIXED: Final = 6
-#: Larger fast corrections, orbit corrections and grid delays are clipped to these ranges of their fields [m].
+#: Fast corrections, orbit corrections and grid delays of larger magnitude are clipped to these values [m].
 _LARGEST_FAST_M, _LARGEST_ORBIT_M, _LARGEST_DELAY_M = 255.0, 31.875, 63.75
 FAST_PERIOD_S: Final = 6  #: Interval between two fast corrections of a satellite [s].
 CLOCK, _ORBIT, _DELAY = 50, 51, 52  #: Seeds of random streams: noise of fast, orbit and delay corrections.
@@ -245,7 +245,7 @@ class Service:
         return [float(delay) for delay in np.clip(total, 0.0, _LARGEST_DELAY_M)]
 
     def fast_messages(self) -> list[Callable[[int, int], Bytes]]:
-        """Return the messages of types 2 to 5 and 24, each as a function of the second and the issue (IODF)."""
+        """Return functions that make the messages of types 2 to 5 and 24 for a given second and issue (IODF)."""
         return [partial(self._fast, block=block) for block in range(-(-len(self.satellites) // _FAST))]
 
     def _fast(self, second: int, issue: int, block: int) -> Bytes:
@@ -257,7 +257,7 @@ class Service:
         return fast(second, values, grades, kind=2 + block, iodf=issue)
 
     def slow_messages(self) -> list[Callable[[int], Bytes]]:
-        """Return all other messages in the order in which they are sent, each as a function of the second."""
+        """Return functions that make the other messages for a given second, in the order in which these are sent."""
         numbers = {int(name[1:]) for name in self.satellites}
         count = len(self.satellites)
         messages: list[Callable[[int], Bytes]] = [

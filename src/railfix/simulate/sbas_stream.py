@@ -145,7 +145,7 @@ class SimulatedDfmc(Service):
         return np.asarray(np.clip(clock, -_LARGEST_M, _LARGEST_M))
 
     def fast_messages(self) -> list[Callable[[int, int], Bytes]]:
-        """Return the messages of types 35 and 36, each as a function of the second and of an (unused) issue."""
+        """Return functions that make the messages of types 35 and 36 from the second and an unused issue."""
 
         def of_kind(kind: int, part: slice) -> Callable[[int, int], Bytes]:
             return lambda second, _: integrity(second, self.indicators(second)[part], kind=kind)

@@ -86,7 +86,7 @@ class VehicleSettings(ScenarioSettings):
     """Vehicle; antenna positions are (along, across to the right, above the rail tops) in metres.
 
     The origin is midway between the bogie centres at the height of the rail tops; the front points in the direction of
-    rising chainage. Cant is measured between the contact points of a wheelset, whose distance is the gauge plus 70 mm.
+    rising chainage. Cant is measured between the contact points of a wheelset, which are the gauge plus 70 mm apart.
     """
 
     name: str = "simulated test car"
@@ -162,8 +162,8 @@ class ReceiverSettings(ScenarioSettings):
     cn0_rise_db: Finite = CN0_RISE_DB
     cn0_satellite_sigma_db: NotNegative = 0.0  #: Standard deviation of constant C/N0 differences between satellites.
     clocks: Literal["separate", "common"] = "separate"  #: The two receivers have separate clocks, or one clock.
-    #: Clock bias of the front receiver at the start; biases of other receivers with separate clocks are fixed
-    #: multiples.
+    #: Clock bias of the front receiver at the start; biases of other receivers with separate clocks are fixed multiples
+    #: of this bias.
     clock_bias_s: float = Field(default=1.2e-4, gt=-0.01, lt=0.01)
     #: Clock drift of the front receiver [s/s]; for other receivers it is multiplied by the same factors as the bias.
     clock_drift: Finite = 2.0e-7

@@ -233,8 +233,8 @@ def sensor_tables(simulation: Simulation) -> dict[str, pl.DataFrame]:
     """Return the tables of the simulated sensors by name; empty if `Scenario.sensors` is None.
 
     The tables are ``tachometer``, ``inertial``, ``radar``, ``ranging``, ``ranging_units``, ``balises`` and
-    ``balise_list``, and, with ground truth, ``wheel_slips`` and ``balise_truth``; they have the columns `COLUMNS`;
-    tables with times are in order of `time_gpst`.
+    ``balise_list``, and two tables of ground truth, ``wheel_slips`` and ``balise_truth``. All tables have the columns
+    `COLUMNS`; tables with times are in order of `time_gpst`.
     """
     settings = simulation.scenario.sensors
     tables: dict[str, pl.DataFrame] = {}

@@ -294,7 +294,9 @@ class InertialSettings(ScenarioSettings):
     #: Standard deviation of the vibration on each accelerometer axis at 20 m/s and more; at lower speeds, it is
     #: proportional to the speed.
     vibration_sigma_mps2: NotNegative = 0.0
-    vibration_sigma_radps: NotNegative = 0.0  #: Vibration sigma of each gyroscope axis at 20 m/s or more, else lower.
+    #: Standard deviation of the vibration on each gyroscope axis at 20 m/s and more; at lower speeds, it is
+    #: proportional to the speed.
+    vibration_sigma_radps: NotNegative = 0.0
     #: Mean frequency of the vibration, with a relative bandwidth of 15 %. Frequencies above half of `rate_hz` are
     #: aliased.
     vibration_hz: Positive = 12.0
@@ -382,7 +384,7 @@ class BaliseSettings(ScenarioSettings):
 
 
 class SensorSettings(ScenarioSettings):
-    """On-board sensors; the vehicle lacks a sensor that is None."""
+    """On-board sensors; None means that the vehicle lacks the sensor."""
 
     tachometer: TachometerSettings | None = TachometerSettings()
     inertial: InertialSettings | None = InertialSettings()
@@ -397,9 +399,9 @@ class SbasSettings(ScenarioSettings):
     band: Literal["L1", "L5"] = "L1"  #: L5 requires receivers with ``signals_per_satellite = 2, second = "L5"``.
     prn: Annotated[int, Field(ge=120, le=158)] = 137
     latency_s: NotNegative = 4.0  #: Time from the instant to which a correction refers to the first bit of its message.
-    udrei: Annotated[int, Field(ge=0, le=13)] = 5  #: UDREI that is sent for all satellites on L1.
+    udrei: Annotated[int, Field(ge=0, le=13)] = 5  #: With band L1, UDREI that is sent for all satellites.
     givei: Annotated[int, Field(ge=0, le=14)] = 9  #: GIVEI that is sent for all grid points.
-    dfrei: Annotated[int, Field(ge=0, le=14)] = 5  #: DFREI that is sent for all satellites on L5.
+    dfrei: Annotated[int, Field(ge=0, le=14)] = 5  #: With band L5, DFREI that is sent for all satellites.
     clock_sigma_m: NotNegative = 0.0  #: Standard deviation of the white error of each clock correction.
     orbit_sigma_m: NotNegative = 0.0  #: Standard deviation of the white error of each axis of an orbit correction.
     delay_sigma_m: NotNegative = 0.0  #: Standard deviation of the white error of each grid delay.

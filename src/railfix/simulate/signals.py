@@ -49,7 +49,7 @@ class Piece:
     clock_m: Floats  #: Receiver clock bias times the speed of light, shape (T,).
     code_sigma_m: Floats  #: Standard deviation of the code noise, shape (T, M).
     clean_code_m: Floats  #: Codes without noise and without disturbances, shape (T, M).
-    error_m: Floats  #: Part of `clean_code_m` due to `Scenario.errors`, which models do not correct, shape (T, M).
+    error_m: Floats  #: Error in `clean_code_m` due to `Scenario.errors`, not corrected by models, shape (T, M).
 
 
 class Simulation:
@@ -75,7 +75,7 @@ class Simulation:
         self.clocks = ReceiverClocks(scenario)
 
     def time(self, first: int = 0, last: int | None = None) -> Datetimes:
-        """Return the time tags (GPS time) of the epochs from `first` up to but not including `last`, by default all."""
+        """Return the time tags (GPS time) of the epochs from `first` up to but excluding `last`, by default of all."""
         last = self.scenario.epochs if last is None else last
         return np.asarray(self.scenario.start + np.arange(first, last) * self.scenario.interval)
 
@@ -335,7 +335,7 @@ def _disturb(
 
 
 def _faults(simulation: Simulation, receiver: Receiver, tag_s: Floats) -> tuple[Floats, Floats]:
-    """Return range errors [m], due to satellites and due to a station's receiver, and their rates [m/s], (T, M)."""
+    """Return range errors due to faults of satellites and of the station [m], and their rates [m/s], (T, M)."""
     names = receiver.names.tolist()
     fault, rate = fault_m(simulation.scenario.errors.faults, tag_s, names)
     for station in simulation.scenario.stations:

@@ -88,7 +88,7 @@ def track_paths(
 
 
 def _carrier(real: Singles, imaginary: Singles, rate_mps: Floats, anchor: Complexes) -> tuple[Floats, Floats]:
-    """Return the phase of the sum of paths [rad], and its rate relative to the rate of the main path [m/s]."""
+    """Return the phase of the sum of paths [rad], and the rate of this phase minus the rate of the main path [m/s]."""
     carrier, quadrature = real.sum(axis=0), imaginary.sum(axis=0)
     angle = np.arctan2(
         quadrature * anchor.real + carrier * anchor.imag, carrier * anchor.real - quadrature * anchor.imag

@@ -115,7 +115,7 @@ class Electrification:
         self.settings = settings
 
     def _number(self, chainage_m: Floats, every: int) -> Floats:
-        """Return the chainage of the mast that is nearest among every `every`-th mast."""
+        """Return the chainage of the nearest mast, where only every n-th mast counts, with n = `every`."""
         spacing = self.settings.spacing_m * every
         return self.settings.first_m + spacing * np.rint((chainage_m - self.settings.first_m) / spacing)
 

@@ -53,7 +53,7 @@ class ElectrificationSettings(ScenarioSettings):
     lateral_m: Positive = 3.0  #: Distance of the axis of a mast from the track axis.
     width_m: Positive = 0.35  #: Width of a mast.
     height_m: Positive = 9.0  #: Height of the top of a mast above the rails.
-    beam_every: int = Field(default=1, ge=0)  #: Beams are at every mast (1), every second mast (2) ...; 0 for none.
+    beam_every: int = Field(default=1, ge=0)  #: Beams are at every mast (1), every second (2) ...; 0 for no beams.
     beam_height_m: Positive = 7.5  #: Height of the middle of a beam above the rails.
     beam_depth_m: Positive = 0.4  #: Depth of a beam.
     wire_height_m: Positive = 5.1  #: Height of the contact wire above the rails, over the track axis.
@@ -62,7 +62,7 @@ class ElectrificationSettings(ScenarioSettings):
 
 
 class RowSettings(ScenarioSettings):
-    """Row of walls along the line (buildings, slopes, mountains); a pair of numbers limits a uniform distribution."""
+    """Row of walls along the line (buildings, slopes); a pair of numbers is the range of a uniform distribution."""
 
     sides: Sides = "both"
     distance_m: Between = (10.0, 30.0)  #: Distance of the wall from the track axis.
@@ -91,7 +91,7 @@ class RoofSettings(ScenarioSettings):
 
     sides: Sides = "both"
     inner_m: NotNegative = 1.8  #: Distance of the inner edge from the track axis; 0 for a roof that covers the track.
-    outer_m: float = Field(default=9.0, gt=0.0, validate_default=True)  #: Distance of the outer edge from the axis.
+    outer_m: float = Field(default=9.0, gt=0.0, validate_default=True)  #: Outer edge's distance from the track axis.
     height_m: Positive = 6.0  #: Height of the roof above the rails.
     length_m: Annotated[Between, at_least(1.0)] = (60.0, 120.0)  #: Range of the uniformly distributed lengths of roofs.
     gap_m: Between = (10.0, 40.0)  #: Range of the uniformly distributed gaps to the next roof.
@@ -129,7 +129,7 @@ class CorrelatorSettings(ScenarioSettings):
 
 
 class AntennaSettings(ScenarioSettings):
-    """Polarisation of the antenna and permittivity of walls; their effect multiplies a wall's `reflection`."""
+    """Polarisation of the antenna and permittivity of walls; the resulting factor multiplies a wall's `reflection`."""
 
     cross_polar_zenith_db: NotNegative = 15.0  #: Loss of left-handed relative to right-handed signals at the zenith.
     cross_polar_horizon_db: NotNegative = 4.0  #: Loss of left-handed relative to right-handed signals at the horizon.
@@ -140,7 +140,7 @@ class AntennaSettings(ScenarioSettings):
 
 
 class SideStreetSettings(ScenarioSettings):
-    """Side streets with walls perpendicular to the line; a pair of numbers limits a uniform distribution."""
+    """Side streets with walls perpendicular to the line; a pair of numbers is the range of a uniform distribution."""
 
     spacing_m: Between = (50.0, 150.0)  #: Distance from the end of a street to the next street.
     width_m: Between = (8.0, 25.0)  #: Distance between the walls of a street.
@@ -154,7 +154,7 @@ class SideStreetSettings(ScenarioSettings):
 
 
 class TreeSettings(ScenarioSettings):
-    """Row of trees along the line; a pair of numbers limits a uniform distribution."""
+    """Row of trees along the line; a pair of numbers is the range of a uniform distribution."""
 
     sides: Sides = "both"
     distance_m: Between = (6.0, 12.0)  #: Distance of the trunks from the track axis.
@@ -165,7 +165,7 @@ class TreeSettings(ScenarioSettings):
     share: Share = 1.0  #: Fraction of the planting positions that have a tree.
     attenuation_db_per_m: NotNegative = 1.0  #: Specific attenuation of a crown.
     most_db: NotNegative = 12.0  #: Largest loss by a crown.
-    scatter: Share = 0.5  #: Fraction of the amplitude lost in a crown that is scattered to the antenna.
+    scatter: Share = 0.5  #: Ratio of the amplitude scattered to the antenna to the amplitude lost in a crown.
 
 
 class NeighbourSettings(ScenarioSettings):

@@ -171,7 +171,7 @@ _LEAST_TWICE: Final = 0.05  #: Rays with a smaller lateral component have no sec
 def second_reflection(
     rows: tuple[Strips, ...], rays: Rays, antenna: AntennaSettings | None
 ) -> tuple[Floats, Floats, Floats]:
-    """Return amplitude, extra path [m] and growth [m/m] of signals reflected twice, on either side; shapes (N,).
+    """Return amplitude, extra path [m] and growth [m/m] of signals reflected twice, once on each side; shapes (N,).
 
     The extra path is ``2 (d_A + d_B) |u_y|`` with the distances d_A and d_B of the first wall row on each side.
     """
