@@ -25,8 +25,8 @@ _GRADIENT_CHANGE: Final = 0.003  #: Smallest change of gradient that counts as a
 _CURVATURE_CHANGE_1PM: Final = 1e-3
 #: Smallest likelihood ratio of an accepted position to any other position in the search window.
 _LIKELIHOOD_RATIO: Final = 1e3
-_GAP_SIGMAS: Final = 3.0  #: Limit of the difference of map and wheel distance since the last feature, in sigmas.
-_FIT_LIMIT: Final = 3.0  #: Limit of the second quantity's mean squared residual, in noise variances.
+_GAP_SIGMAS: Final = 3.0  #: Largest accepted difference of map and wheel distance since the last feature [sigma].
+_FIT_LIMIT: Final = 3.0  #: Largest accepted mean squared residual of the second quantity, in noise variances.
 SCALE_SIGMA: Final = 2e-3  #: Relative standard deviation of a distance from wheel pulses.
 STEP_M: Final = 1.0  #: Spacing of the series along the line.
 HALF_LENGTH_M: Final = 60.0  #: Length of the line compared before a feature, and after it.

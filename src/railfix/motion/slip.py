@@ -57,7 +57,7 @@ _LATCH_SHARE: Final = 0.01  #: As `_LATCH_MPS`, but a fraction of the speed; the
 _LATCH_S: Final = 0.5  #: Time for which the speeds must agree before a slip ends.
 #: Integration of a slip's inertial speed starts before the detection, by this time + `confirm_s` + `SMOOTHING_S`.
 LOOK_BACK_S: Final = 0.3
-#: Longest use of an inertial speed; with the assumed drift `carry_drift_mps2`, its error is then 0.3 m/s.
+#: An inertial speed expires after this time; with the drift `carry_drift_mps2`, its error has then grown to 0.3 m/s.
 _LONGEST_CARRY_S: Final = 30.0
 #: Time constant of the low-pass filter of the pitch. It suppresses pitching of the body (about 1 Hz) and vibration.
 SMOOTHING_S: Final = 0.2
@@ -97,7 +97,7 @@ class SlipResult:
     """Speed, distance and state of motion at N samples."""
 
     state: Codes  #: Values of `MotionState`, shape (N,).
-    #: Speed, shape (N,): wheel speed in NORMAL, NaN in INIT and EXPIRED, 0 or the inertial speed in other states.
+    #: Speed, shape (N,): wheel speed in NORMAL, NaN in INIT and EXPIRED, inertial speed (0 at rest) in other states.
     speed_mps: Floats
     #: Integral of the speed from the first sample, shape (N,); the inertial speed of a slip begins before its detection
     #: (`LOOK_BACK_S`). At the end of a slip, the distance is corrected for the difference of wheel and inertial speeds,

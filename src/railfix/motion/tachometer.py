@@ -85,10 +85,10 @@ def pulse_speeds(pulses: TachometerPulses, time: Datetimes, *, limits: Tachomete
 
 
 def window_start(time: Datetimes, last: Indices, window_s: float) -> Indices:
-    """Return the index of the first pulse in the window that ends at each pulse `last`.
+    """Return, for each pulse in `last`, the index of the first pulse of the window that ends at this pulse.
 
-    The first pulse is the latest pulse at least `window_s` before `last`, or pulse 0 if there is none. It is never
-    `last` itself, except for pulse 0.
+    The first pulse is the latest pulse at least `window_s` before the end, or pulse 0 if no pulse is that early. Only
+    for pulse 0 are the first pulse and the end the same pulse.
     """
     start = np.searchsorted(time, time[last] - timedelta(np.full(len(last), window_s)), side="right") - 1
     return np.asarray(np.maximum(np.minimum(start, last - 1), 0), dtype=np.intp)
@@ -122,8 +122,8 @@ def distance_m(pulses: TachometerPulses, time: Datetimes, *, limits: TachometerL
 def tooth_faults(pulses: TachometerPulses) -> tuple[Masks, Masks]:
     """Return masks of the pulses that follow a lost pulse, and of doubled pulses, shape (P,) each.
 
-    A pulse is lost in an interval about twice as long as each of its two neighbours, or where `pulse` numbers are
-    missing. A pulse is doubled if the sum of the intervals before and after it equals each neighbouring interval.
+    A pulse is lost in an interval about twice as long as each adjacent interval, or where `pulse` numbers are missing.
+    A pulse is doubled if the sum of the intervals before and after the pulse equals each adjacent interval.
     """
     count = len(pulses)
     lost, doubled = np.zeros(count, dtype=np.bool_), np.zeros(count, dtype=np.bool_)
@@ -169,7 +169,7 @@ def check_speeds(time: Datetimes, speed_mps: Floats, right_time: Datetimes, righ
     """Estimate scale, unit and delay of logged speeds by least squares over a grid of delays.
 
     `speed_mps`, shape (N,), are logged speeds. `right_mps`, shape (M,), are reference speeds, for example from
-    Dopplers. Absolute speeds are compared. Raise ValueError for fewer than ten pairs above 1 m/s.
+    Dopplers. Absolute speeds are compared. Raise ValueError for fewer than ten pairs of speeds above 1 m/s.
     """
     known = np.isfinite(right_mps)
     right_t = seconds(right_time[known] - right_time[0])

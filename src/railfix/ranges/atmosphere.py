@@ -24,7 +24,7 @@ _SHELL: Final = 6_378.1363 / (6_378.1363 + 350.0)
 
 
 def thin_shell_obliquity(elevation_deg: Floats) -> Floats:
-    """Return the slant-to-vertical delay ratio of a thin shell (DO-229D A.4.4.10.4); NaN at or below 0.1 deg."""
+    """Return the slant-to-vertical delay ratio of a thin shell (DO-229D A.4.4.10.4); NaN up to 0.1 deg elevation."""
     cosine = np.cos(np.radians(np.where(elevation_deg > 0.1, elevation_deg, np.nan)))
     return np.asarray(1.0 / np.sqrt(1.0 - (_SHELL * cosine) ** 2))
 
@@ -145,7 +145,7 @@ def model_delays(
     ionosphere_sigma_m: float = 0.0,
     troposphere: str,
 ) -> Delays:
-    """Return the Klobuchar and Saastamoinen delays; 0 if the model is off (`klobuchar` None, `troposphere` "off")."""
+    """Return Klobuchar and Saastamoinen delays; each is 0 if its model is off (`klobuchar` None, `troposphere` off)."""
     shape = seen.elevation_deg.shape
     ionosphere, troposphere_m, sigma = np.zeros((3, *shape))
     if klobuchar is not None:

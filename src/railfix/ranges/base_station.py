@@ -20,9 +20,9 @@ from railfix.ranges.sources import BaseDifferences, CorrectionSource, SourceDela
 Values = TypeVar("Values", Floats, Integers)
 #: A station epoch may be up to this time [s] later than the train's epoch, because the two receiver clocks differ.
 _SAME_S: Final = 0.05
-#: Older station code errors are not used [s]. Without selective availability, they change by centimetres in 30 s.
+#: Code errors older than this [s] are not used; they change by centimetres in 30 s without selective availability.
 LONGEST_AGE_S: Final = 60.0
-#: Older station phase errors are not used [s]. They change by millimetres in a second.
+#: Phase errors older than this [s] are not used. Phase errors change by millimetres in a second.
 _PHASE_AGE_S: Final = 1.1
 #: Part of the sigma of corrected ranges that is proportional to the distance between station and train [m/km]; it
 #: covers differences of ionospheric, tropospheric and orbit errors.
@@ -33,7 +33,7 @@ LONGEST_KM: Final = 100.0  #: Ranges are not corrected if the train is farther t
 class BaseLimits(Settings):
     """Settings of the corrections by a base station."""
 
-    #: Standard deviation of the corrections due to the station's smoothed multipath [m]; the train's noise is added.
+    #: Sigma of the station's smoothed multipath in the corrections [m]; the noise of the train's receiver is added.
     sigma_m: float = Field(default=0.3, gt=0)
     #: Random walk of an ambiguity [m/sqrt(s)]; with a base station, it replaces `PhaseLimits.drift_m`.
     drift_m: float = Field(default=0.001, ge=0)
@@ -48,7 +48,7 @@ class BaseErrors:
     #: Satellite and signal of each channel, shape (S,).
     satellite: Strings
     signal: Strings
-    #: Corrected code minus geometric range and receiver clock offset for the constellation, shape (B, S). It is NaN
+    #: Corrected code minus geometric range and minus the receiver clock offset of the constellation, shape (B, S); NaN
     #: where no code was observed.
     code_m: Floats
     #: Corrected phase minus geometric range and minus a clock offset common to all channels, shape (B, S). The
@@ -98,8 +98,8 @@ class BaseErrors:
         `receiver_ecef_m` are approximate positions of the train, shape (T, 3).
 
         For a channel that the station does not observe, another signal of the same band is used; the errors of the two
-        signals are assumed to differ by a constant that is common to a constellation. Where the station has no recent
-        error, or is farther away than `LONGEST_KM`, the errors are NaN and the arcs -1.
+        signals are assumed to differ by a constant that is common to all satellites of a constellation. Where the
+        station has no recent error, or is farther than `LONGEST_KM` from the train, the errors are NaN and the arcs -1.
         """
         shape = (len(time), len(satellite))
         of_band = {(name, code[:1]): k for k, (name, code) in enumerate(self.keys)}

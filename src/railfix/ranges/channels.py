@@ -107,7 +107,7 @@ class Channels:
     left_out: Integers  #: Reason why a channel is not selected, shape (M,); 0 for selected channels.
     member: Integers  #: 1 where a channel belongs to one of the S satellites, else 0; shape (M, S).
     #: Columns, in the observations, of the second signals of each channel's satellite in order of preference, shape (K,
-    #: P); -1 for none. P is 0 if no second signals are wanted, else at least 1.
+    #: P); -1 where the log has no such signal. P is 0 if no second signals are wanted, else at least 1.
     second: Indices
     second_signal: Strings  #: Second signals with constellation letter ("G5Q"); "" for none; shape (K, P).
     second_ratio: Floats  #: Squared ratio of the first to the second frequency, shape (K, P).

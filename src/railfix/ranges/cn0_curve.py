@@ -82,7 +82,7 @@ class Cn0Mean:
         return PchipInterpolator(self.elevation_deg, self.mean_dbhz)
 
     def at(self, elevation_deg: ArrayLike) -> Floats:
-        """Return the mean C/N0 at the given elevations [dB-Hz]; NaN for NaN and below the lowest bin."""
+        """Return the mean C/N0 at given elevations [dB-Hz]; NaN where the elevation is NaN or below the lowest bin."""
         elevation = np.asarray(elevation_deg, dtype=np.float64)
         lowest, highest = self.elevation_deg[0], self.elevation_deg[-1]
         half = (self.elevation_deg[1] - lowest) / 2.0

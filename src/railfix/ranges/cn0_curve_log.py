@@ -24,8 +24,8 @@ from railfix.ranges.cn0_curve_fit import Cn0Samples, CurveFit, fit_cn0_curve
 
 _SHORT_S: Final = 12 * 3600.0  #: A log shorter than this causes a note [s]; P1 2.3(1) requires about a day.
 _DEFICIT_DBHZ: Final = 10.0  #: P1 (table 6) rejects a signal whose C/N0 is lower than the mean by more than this [dB].
-#: Of the samples above the first value [deg], at most the second value (a fraction) may be more than `_DEFICIT_DBHZ`
-#: below the curve; if there are more, a note is issued.
+#: Of the samples at elevations above the first value [deg], at most the second value (a fraction) may be more than
+#: `_DEFICIT_DBHZ` below the curve; if there are more, a note is issued.
 _CHECKED_FROM_DEG, _REJECTED_SHARE = 15.0, 0.01
 #: A tracked satellite below this elevation [deg] indicates a wrong antenna position.
 _BELOW_DEG: Final = -5.0

@@ -56,7 +56,7 @@ class SecondCodes:
     noise_m: Floats  #: Sigma of noise and multipath used for the weights, shape (T, K).
     cn0_dbhz: Floats  #: C/N0 of the second signal, shape (T, K).
     group_delay_m: Floats  #: Group delay subtracted from the second code, shape (T, K).
-    #: Sigma of the part of the group delay that is not broadcast; 0 where all is broadcast.
+    #: Sigma of the part of the group delay that is not broadcast; 0 where the whole group delay is broadcast.
     #: `TwoFrequencyLimits.delay_sigma_m` is added in quadrature; shape (T, K).
     delay_sigma_m: Floats
     ratio: Floats  #: Square of the ratio of the first to the second frequency, shape (T, K).
@@ -78,10 +78,10 @@ class CorrectedRanges(AntennaRanges, OnDemand):
     nominal_m: Floats
     #: Sigma computed by `NominalErrors` from elevation and ionospheric delay, shape (T, K); 0 with SBAS.
     nominal_elevation_sigma_m: Floats
-    #: Overbounding sigma and largest nominal bias of each range from an error model; 0 without a model; shape (T, K).
+    #: By the error model, overbounding sigma and largest nominal bias of each range; 0 without a model; (T, K).
     bound_sigma_m: Floats
     bias_m: Floats
-    #: True at epochs with a gross error in an unknown channel, shape (T,). Estimates of noise and map exclude them.
+    #: True at epochs with a gross error in an unknown channel, (T,). Noise and map estimates exclude these epochs.
     unsure: Masks
     second: SecondCodes | None = None  #: Second codes of the satellites (`find_second_codes`), or None.
     base: BaseDifferences | None = None  #: Base-station corrections in use, or None.
@@ -131,8 +131,8 @@ def find_satellites(
     source : CorrectionSource
         `BroadcastSource`, `SbasSource`, `DfmcSource` or `BaseStationSource`.
     max_age_s : float, optional
-        Records are not used at epochs farther than this from their reference time; the limit applies only if it is
-        shorter than the validity of the record.
+        A record is not used at epochs farther than this from the record's reference time; the limit applies only if it
+        is shorter than the validity of the record.
     """
     code = observations.code_m[:, channels.columns]
     reason = _reasons_of_codes(channels.satellite, code)
@@ -186,12 +186,12 @@ def corrected_ranges(
     Returns
     -------
     CorrectedRanges
-        Codes that cannot be used have a rejection reason; their values are kept, but NaN if a correction is missing.
+        Unusable codes have a rejection reason; the values of these codes are kept, but NaN if a correction is missing.
 
     Raises
     ------
     ValueError
-        `near_ecef_m` has neither of these shapes.
+        `near_ecef_m` has neither shape (3,) nor shape (T, 3).
     """
     noise, time = noise or CodeNoise(), observations.time
     near = _check_near(near_ecef_m, len(time))

@@ -90,7 +90,7 @@ class ErrorBins(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class BinStatistics:
-    """Statistics of every bin, shape (E, A, C); NaN for fewer than three pooled samples."""
+    """Statistics of every bin, shape (E, A, C); biases and sigmas from fewer than three pooled samples are NaN."""
 
     count: Integers  #: Number of samples in the bin.
     #: Number of blocks in the bin. A block has the samples of one satellite in a time interval
@@ -115,7 +115,7 @@ class ErrorModelSource(Settings):
     files: tuple[tuple[str, str], ...] = ()  #: Name and SHA-256 of each input file.
 
 
-LARGEST_PRIOR: Final = 0.05  #: Bounds of fault priors above this allow no finite protection level.
+LARGEST_PRIOR: Final = 0.05  #: If the bound of a fault prior exceeds this, no protection level is finite.
 
 
 class FaultRate(Settings):

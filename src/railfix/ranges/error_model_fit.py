@@ -30,7 +30,7 @@ def gaussian_overbound(error_m: Floats) -> tuple[float, float]:
     Counted from either end, the k-th of n samples is the quantile of probability ``k / (n + 1)``. With the absolute
     value of the median as bias, sigma is the least value that bounds both tails (beyond one standard score). With this
     sigma, the bias is increased until it bounds all samples. Beyond the largest sample the bound is a normal
-    extrapolation. Raises ValueError for fewer than three samples, or if one is not finite.
+    extrapolation. Raises ValueError for fewer than three samples, or if a sample is not finite.
     """
     if len(error_m) < 3 or not np.isfinite(error_m).all():
         raise ValueError("an overbound needs at least three samples, all finite")
@@ -219,7 +219,7 @@ def _upper(hits: int, trials: int) -> float:
 
 
 def _sides_of_two(samples: ErrorSamples, which: Masks) -> int:
-    """Count intervals with two or more satellites on a side in the samples `which`; sides count separately."""
+    """Count, in the samples `which`, intervals with two or more satellites on one side; each side counts separately."""
     right = np.sin(np.radians(samples.relative_azimuth_deg[which])) > 0.0
     one = np.unique(np.stack([right.astype(np.int64), samples.block[which]], axis=1), axis=0)
     _, satellites = np.unique(np.stack([one[:, 0], one[:, 1] // _SATELLITES], axis=1), axis=0, return_counts=True)
@@ -255,7 +255,7 @@ def faulty_stretches(samples: ErrorSamples) -> tuple[tuple[float, float], ...]:
 
 
 def _together(every: Integers, bad: Integers) -> float:
-    """Return the observed over the expected number of intervals with several faulty satellites; 0 without faults."""
+    """Return the ratio of observed to expected intervals with two or more faulty satellites; 0 without faults."""
     if not len(bad):
         return 0.0
     times, satellites = np.unique(every // _SATELLITES, return_counts=True)

@@ -47,7 +47,7 @@ class SourceDelays(NamedTuple):
 
     delays: Delays  #: Delays that are subtracted from the codes.
     sigma_m: Floats  #: Sigma added in quadrature to receiver noise for the weights, shape (T, K).
-    #: Sigma of satellite and atmospheric errors, and the part of it computed by `NominalErrors`; shape (T, K).
+    #: Sigma of satellite and atmospheric errors, and the part of this sigma computed by `NominalErrors`; shape (T, K).
     nominal_m: Floats
     nominal_elevation_sigma_m: Floats
     base: BaseDifferences | None = None  #: Base-station corrections to be subtracted, or None.

@@ -58,7 +58,7 @@ class AntennaPairLimits(Settings):
     azimuth_error_deg: float = Field(default=3.5, ge=0.0, le=90.0)
     #: Both receivers share one clock ("common"), or a median removes the difference of their clocks ("median").
     clocks: Literal["common", "median"] = "median"
-    #: With clocks "median", constellations with fewer common satellites are not tested.
+    #: With clocks "median", constellations with fewer than this many satellites seen by both antennas are not tested.
     least_satellites: int = Field(default=4, ge=3)
     #: Epochs are paired if their time tags differ by at most this.
     tag_tolerance_s: float = Field(default=0.01, ge=0.0, lt=1.0)
@@ -212,9 +212,9 @@ def antenna_pair_screen(
     Returns
     -------
     AntennaPairScreened
-        The metric is NaN, and nothing is rejected, where a pseudorange or the spacing is missing. The same applies to
-        constellations with fewer than `least_satellites` satellites (clocks "median"), and to epochs with separate
-        clocks ("common").
+        The metric is NaN, and nothing is rejected, where a pseudorange or the spacing is missing, for constellations
+        with fewer than `least_satellites` satellites (clocks "median"), and at epochs with separate clocks (clocks
+        "common").
     """
     limits = limits or AntennaPairLimits()
     front, rear = np.asarray(code_front_m, dtype=np.float64), np.asarray(code_rear_m, dtype=np.float64)

@@ -48,7 +48,7 @@ def antenna_spacing_screen(
         Chainages at the same instants along one line; a pair with NaN is not rejected.
     spacing_m : array_like, shape (P,) or scalar [m]
         Expected distance from the rear to the front position, not negative. It is the antenna spacing if the chainages
-        are the chainages of the antennas, and 0 if both refer to one reference point.
+        are the chainages of the antennas, and 0 if both chainages refer to one reference point.
     facing : array_like of int, shape (P,) or scalar
         Direction of the vehicle's front: 1 towards rising chainage, -1 towards falling chainage, 0 if unknown. With 0
         the order of the two positions is not tested.
@@ -107,8 +107,8 @@ class AntennaSpacingScreen(PositionScreen[AntennaSpacingLimits]):
     ) -> Screened:
         """Return the metric and the verdict for pairs of filtered positions.
 
-        A pair is rejected where the distance deviates from the spacing, or the speeds differ, by more than the limit
-        and by more than `filter_sigmas` standard deviations.
+        A pair is rejected where the distance deviates from the spacing, or the speeds differ, by more than `limit_m` or
+        `filter_speed_mps`, respectively, and by more than `filter_sigmas` standard deviations.
         """
         found = self.judge(front.chainage_m, rear.chainage_m, pair, limits)
         apart = np.abs(found.metric) > limits.filter_sigmas * np.hypot(front.sigma_m, rear.sigma_m)

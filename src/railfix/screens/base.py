@@ -97,7 +97,7 @@ class ObservationPicture(NamedTuple):
     label: str
     metric: str  #: Column of the observations.
     reason: Reason  #: Rejection reason of the observations drawn as rejected.
-    limit: str  #: Name of a field of the screen's limits (if it is None, no picture), or of an observation column.
+    limit: str  #: Name of an observation column or a field of the screen's limits (no picture if the field is None).
     sides: Literal["both", "above", "below"] = "both"
 
 

@@ -43,7 +43,7 @@ class DopplerLimits(Settings):
 
     #: How the limit is determined: fixed as in P1, scaled by the receiver's noise, or scaled by the pseudorange sigmas.
     mode: Literal["fixed", "receiver", "sigma"] = "receiver"
-    #: Largest accepted pseudorange change minus Doppler-derived change, up to `short_interval_s`; P1 table 6: 1.5.
+    #: For intervals up to `short_interval_s`: largest accepted code change minus Doppler change; P1 table 6: 1.5.
     step_m: float = Field(default=1.5, gt=0.0, allow_inf_nan=False)
     #: Interval up to which the limit is constant. The default allows for one lost epoch at P1's interval of 0.1 s.
     short_interval_s: float = Field(default=0.2, gt=0.0, allow_inf_nan=False)

@@ -143,4 +143,4 @@ class PositionScreen(_OfTwoAntennas[Limits]):
     def judge_filtered(
         self, front: FilteredMotion, rear: FilteredMotion, pair: PairedEpochs, limits: Limits
     ) -> Screened:
-        """Return the metric, and whether it is within its limit, for P pairs of filtered positions and speeds."""
+        """Return the metric and the verdict for P pairs of filtered positions and speeds."""

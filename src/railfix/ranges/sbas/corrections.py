@@ -44,7 +44,7 @@ _SIGMA_UDRE: Final = np.sqrt(np.array([*UDRE_VARIANCE_M2, np.nan, np.nan, np.nan
 
 
 def best_prn(messages: SbasMessages, limits: SbasLimits | None = None) -> tuple[int, str]:
-    """Return the PRN with the most usable fast corrections (if equal, the smallest), and a note on the choice.
+    """Return the PRN with the largest number of usable fast corrections (of several, the smallest PRN), and a note.
 
     The choice depends on all messages of a log, and must be made before positioning begins. For live messages, the PRN
     must therefore be specified.
@@ -124,8 +124,8 @@ class SbasCorrections:
         """Return the fast and long-term corrections for T epochs and K satellites.
 
         The state of satellites outside the mask is NOT_IN_MASK. A long-term correction is applied only if `navigation`
-        has a record with its issue of data; otherwise the latest earlier correction with a different issue is tried.
-        Without navigation data, the newest correction is applied unchecked.
+        has a record with the same issue of data; otherwise the latest earlier correction with a different issue is
+        tried. Without navigation data, the newest correction is applied unchecked.
         """
         number = np.array([_NUMBER_OF.get(str(name), -1) for name in satellite], dtype=np.int64)
         tables, limits, at = self._tables, self.limits, time[:, None]
@@ -216,7 +216,7 @@ class SbasCorrections:
 
         `corrections` are the corrections at these epochs; `line_of_sight`, shape (T, K, 3), has unit vectors to the
         satellites in the Earth-fixed frame; the receiver coordinates have shape (T,). The factor is 1 where the GEO
-        sends neither type, and NaN where service messages are incomplete and incomplete data are rejected.
+        sends neither type 27 nor 28, and NaN where service messages are incomplete and incomplete data are rejected.
         """
         factor, incomplete = self._service.factor(time, latitude_deg, longitude_deg)
         along = delta_udre_covariance(self._tables, time, corrections.covariance, line_of_sight)

@@ -27,7 +27,7 @@ _UPPER: Final = ([0, 0, 0, 1, 1, 2], [1, 2, 3, 2, 3, 3])
 
 
 class BitField(NamedTuple):
-    """Bit field of a message: one number, or `number` numbers that begin `step` bits apart (`step` None: `length`)."""
+    """Bit field of a message: one number, or `number` numbers that begin `step` (by default `length`) bits apart."""
 
     first: int
     length: int
@@ -195,7 +195,7 @@ def time_near(time_of_day_s: Floats, near: Datetimes) -> Datetimes:
 
 
 def prn_masks(messages: SbasMessages) -> Decoded:
-    """Return the masks of type 1: `iodp` (n,), and `number` (n, 51), the mask number of each slot, 0 if empty."""
+    """Return the masks of type 1: `iodp` (n,), and `number` (n, 51), the mask number of each slot (0: empty slot)."""
     decoded = decode(messages, 1)
     message, bit = np.nonzero(decoded.pop("member"))
     slot = np.arange(len(message)) - np.searchsorted(message, message)

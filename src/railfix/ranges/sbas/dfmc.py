@@ -6,12 +6,12 @@ ionosphere-free ranges. For L1 C/A and L5, and for E1 and E5a, the clock correct
 from ranges of B1C and B2a, the group delays of B-CNAV1 must be subtracted. GLONASS has slots in the mask, but its
 corrections are for the signals L1OC and L3OC, which are not read.
 
-The text of these standards was not available. Message layouts are taken from cssrlib (sbas.py), the least values of
-sigma and the degradation from MAAST (L5_decodeMT37.m, L5_decode_satcorr.m, after ED-259A), and the slots of the mask
-from cssrlib, MAAST and Wireshark (packet-sbas_l5.c). An hour of messages of SouthPAN and BDSBAS (`test_sbas_dfmc.py`)
-shows that the slot number has 8 bits and `rate_share` 4 bits, as in cssrlib, and that the issue of data for BeiDou is
-the IODE of B-CNAV1. BDSBAS corrects the clocks of BeiDou-3 by decimetres. Group delays differ by metres; these
-corrections can therefore not include group delays.
+The text of these standards was not available. Message layouts are taken from cssrlib (sbas.py), the degradation and the
+least values of sigma from MAAST (L5_decodeMT37.m, L5_decode_satcorr.m, after ED-259A), and the slots of the mask from
+cssrlib, MAAST and Wireshark (packet-sbas_l5.c). An hour of messages of SouthPAN and BDSBAS (`test_sbas_dfmc.py`) shows
+that the slot number has 8 bits and `rate_share` 4 bits, as in cssrlib, and that the issue of data for BeiDou is the
+IODE of B-CNAV1. BDSBAS corrects the clocks of BeiDou-3 by decimetres. Group delays differ by metres; these corrections
+can therefore not include group delays.
 
 The orbits of SBAS satellites (ephemerides in types 39 and 40, almanacs in type 47) are used only for a note of the run.
 Layouts and scales of these messages are the same in cssrlib and MAAST (L5_decodeMT39.m, 40, 47). SouthPAN messages of
@@ -148,7 +148,7 @@ def residual_ionosphere_m(elevation_deg: Floats) -> Floats:
 
 
 def _newest(sent: Datetimes, time: Datetimes) -> tuple[Integers, Floats]:
-    """Return the row and the age [s] of the newest message at each epoch; -1 and infinity without a message."""
+    """Return row and age [s] of the newest message at each epoch; without a message, row -1 and an infinite age."""
     row = np.searchsorted(sent, time, side="right") - 1
     ages = seconds(time - np.append(sent, np.datetime64("NaT", "ns"))[row])
     return row, np.where(row >= 0, ages, np.inf)
@@ -261,7 +261,7 @@ class DfmcService:
         own["growth_m"][good] = np.floor(age / interval) * scale["step_m"][ten, kind] + rate * age
 
     def _newest(self, kind: int, time: Datetimes, longest_s: float) -> Integers:
-        """Return the row of the newest message of a type; -1 if the message is older than `longest_s`."""
+        """Return the row of the newest message of a type; -1 if none was received in the last `longest_s`."""
         row, age = _newest(self._time[kind], time)
         return np.where(age <= longest_s, row, -1)
 
@@ -276,7 +276,7 @@ class DfmcService:
         return (mask >= 0) & (member[:, slot - 1] == 1), member[:, : slot - 1].sum(axis=1)
 
     def _all_indicators(self) -> tuple[Datetimes, Integers, Integers]:
-        """Return times, mask issues and indicators of all satellites from types 34 to 36; -1 where not transmitted.
+        """Return times, mask issues and indicators of all satellites from types 34 to 36; an indicator not sent is -1.
 
         Codes of type 34: 0 unchanged, 1 new indicator, 2 indicator increased by one (`_ONE_MORE`), 3 do not use.
         """
@@ -396,7 +396,7 @@ class SbasOrbits:
 
 
 def ephemerides(messages: SbasMessages, valid_s: float) -> SbasOrbits:
-    """Return a satellite's ephemerides, each from types 39 and 40 with equal issue, received within `valid_s`."""
+    """Return a satellite's ephemerides, each from types 39 and 40 with equal issue, at most `valid_s` apart."""
     rows = {kind: np.flatnonzero(messages.type == kind) for kind in (39, 40)}
     sent = {kind: read_fields(messages.bits[at], _ORBIT_LAYOUTS[kind]) for kind, at in rows.items()}
     newest: dict[tuple[int, int], int] = {}

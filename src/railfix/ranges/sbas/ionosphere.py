@@ -61,7 +61,7 @@ def point_number(latitude_deg: NDArray[np.generic], longitude_deg: NDArray[np.ge
 
 
 def _layout() -> tuple[Integers, Integers]:
-    """Return the grid point of each bit of each band, and up to two pairs of band and bit per point; -1 for none."""
+    """Return the grid point of each bit of each band (-1: none), and up to two bits of each grid point (-1: no bit)."""
     point = np.full((BANDS, BITS), -1, dtype=np.int64)
     cells = np.full((ROWS * COLUMNS, 2), -1, dtype=np.int64)
     for band in range(BANDS):
@@ -124,7 +124,7 @@ class GridTables:
         return self._by_issue.in_force(row, time, self._stops.last(time), self._mask_limit)
 
     def in_mask(self, point: Integers, time: Datetimes) -> Masks:
-        """Return True for points that are in the newest mask of one of their bands, provided that it is in force."""
+        """Return True for points in the newest mask of one of their bands, provided that the mask is in force."""
         inside, stop = np.zeros(np.broadcast_shapes(point.shape, time.shape), dtype=bool), self._stops.last(time)
         for cell in np.moveaxis(CELLS_OF_POINT[point], -1, 0):
             row = self._by_cell.newest(cell, time)
@@ -203,7 +203,7 @@ def pierce_point(
 def triangle_weights(x: Floats, y: Floats, missing: int) -> Floats:
     """Return the weights of the corners SW, NW, SE and NE of a cell if one corner is missing, shape (..., 4).
 
-    Outside the triangle of the other corners, one weight is negative.
+    Outside the triangle of the three remaining corners, one weight is negative.
     """
     zero = np.zeros_like(x)
     weights = {
@@ -272,7 +272,7 @@ def _choose(
 
 
 def _choose_polar(grid: GridTables, time: Datetimes, latitude: Floats, longitude: Floats) -> tuple[Integers, Floats]:
-    """Return points and weights (M, 4) beyond 75 deg latitude; -1 and NaN if one of four points is not in the mask."""
+    """Beyond 75 deg latitude, return points (M, 4; all -1 if the mask lacks one) and weights (M, 4; then NaN)."""
     north = latitude >= 0.0
     sign = np.where(north, 1.0, -1.0)
     west = np.floor(longitude / 10.0) * 10.0

@@ -32,7 +32,7 @@ class FastInForce:
     timed_out: Masks  #: True where the correction is too old, or the mask is not active.
     no_factor: Masks  #: True where no type 7 is in force.
     no_rate: Masks  #: True where a range rate is required but unknown.
-    udrei: Integers  #: UDREI, -1 if it was not received.
+    udrei: Integers  #: UDREI; -1 where no UDREI was received.
     correction_m: Floats
     rate_mps: Floats
     growth_m: Floats  #: Degradation due to the age of the correction (A.4.5.1.1).
@@ -201,7 +201,7 @@ def long_term_in_force(
 def covariance_in_force(
     tables: SatelliteTables, limits: SbasLimits, time: Datetimes, number: Integers, stop: Datetimes
 ) -> tuple[Integers, Masks]:
-    """Return the row of the covariance in force, and a mask of satellites without it although the GEO sends type 28."""
+    """Return the row of the covariance in force, and a mask of satellites lacking it although the GEO sends type 28."""
     table, limit, sent_at = tables.covariance, limits.timeout_s("covariance"), tables.covariance_time
     row = table.newest(number[None, :], time[:, None])
     if not len(sent_at):
@@ -215,7 +215,7 @@ def covariance_in_force(
 
 @dataclass(frozen=True, kw_only=True)
 class Growth:
-    """Degradation terms [m], shape (T, K); `missing` is True without type 10, `rss` where squares are summed."""
+    """Degradation terms [m], (T, K); `missing` is True without type 10, `rss` where squares of terms are summed."""
 
     fast_m: Floats
     rate_m: Floats

@@ -74,10 +74,10 @@ SERVICE_FACTOR: Final = (1.0, 1.1, 1.25, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0
 NOT_MONITORED: Final = 14  #: UDREI of a satellite that is not monitored.
 DO_NOT_USE: Final = 15  #: UDREI of a satellite that must not be used.
 STOP_S: Final = 60.0  #: After a message of type 0, the GEO is not used for this time [s] (DO-229D, A.4.4.1).
-#: Older messages are not used [s], even if type 6 renews a fast correction. The limit is the longest time-out except
-#: that of service messages, to which the limit does not apply.
+#: Messages older than this [s] are not used, even if type 6 renews a fast correction. The limit is the longest time-out
+#: except that of service messages, to which the limit does not apply.
 OLDEST_S: Final = max(of_mode for kind, both in TIMEOUT_S.items() if kind != "service" for of_mode in both)
-#: Message types (stops and masks) that affect messages received later; they are therefore kept for twice `OLDEST_S`.
+#: Message types (stops and masks) that affect later messages, so that stops and masks are kept for twice `OLDEST_S`.
 LEANT_ON: Final = (0, 1, 18)
 INFLATION_M: Final = 8.0  #: Increase of sigma UDRE where degradation data are missing [m] (DO-229D, J.2.2).
 

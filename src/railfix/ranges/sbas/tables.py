@@ -76,7 +76,7 @@ class Series:
         return replace(self, columns={**self.columns, **columns})
 
     def newest(self, series: Integers | int, time: Datetimes) -> Integers:
-        """Return the newest row of each series at or before each instant; -1 for no row within `OLDEST_S`."""
+        """Return the newest row of each series at or before each instant; -1 without a row within `OLDEST_S`."""
         since = (time - GPS_EPOCH).astype("timedelta64[ns]").astype(np.int64) // _MS
         wanted_series, wanted_time = np.broadcast_arrays(series, np.clip(since, 0, _SPAN - 1))
         wanted = wanted_series * _SPAN + wanted_time
@@ -138,7 +138,7 @@ class MaskTable:
         return table.in_force(row, time, self._stops.last(time), self._limit)
 
     def holds(self, number: Integers, time: Datetimes) -> tuple[Masks, Masks]:
-        """Return True for epochs (T,) with an active PRN mask, and for satellites (T, K) in the PRN mask in force."""
+        """Return whether a PRN mask is in force at each epoch (T,), and whether this mask has each satellite (T, K)."""
         row = self._by_time.newest(0, time)
         known = self._in_force(self._by_time, row, time)
         return known, self._by_time["member"][row][:, np.maximum(number, 0)] & known[:, None]

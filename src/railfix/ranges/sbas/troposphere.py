@@ -53,7 +53,7 @@ def rtca_troposphere_m(time: Datetimes, latitude_deg: Floats, height_m: Floats, 
     """Return the tropospheric slant delay of RTCA DO-229D (A.4.2.4) from latitude and day of year, shape (T, K) [m].
 
     The model is for heights above mean sea level; with ellipsoidal heights, the delay changes by 1 mm per 3 m of geoid
-    height. The delay is NaN below 2 degrees, and at heights outside -100 m to 10 km.
+    height. The delay is NaN at elevations below 2 degrees, and at heights outside -100 m to 10 km.
     """
     year = time.astype("datetime64[Y]").astype("datetime64[ns]")
     day = (time - year) / np.timedelta64(1, "D") + 1.0
