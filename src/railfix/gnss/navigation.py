@@ -95,7 +95,7 @@ class KeplerRecords(_NavigationRecords):
     #: Inter-signal corrections, shape (n, 6). Columns of GPS and QZSS: L1 C/A, L2C, L5I5, L5Q5, L1C_D, L1C_P. Columns
     #: of BeiDou: B1C_D and B2a_D. Other values are NaN.
     inter_signal_s: Floats
-    #: Fit interval of GPS and QZSS (QZSS flag 0 -> 2, 1 -> 4; GPS flag 0 -> 4), otherwise NaN; shape (n,) [h].
+    #: Fit interval [h] of GPS (flag 0 means 4 h, 1 means 6 h) and QZSS (0 means 2 h, 1 means 4 h), else NaN; (n,).
     fit_interval_h: Floats
 
 

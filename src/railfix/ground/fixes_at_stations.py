@@ -209,7 +209,7 @@ def round_tags(time: Datetimes) -> Datetimes:
 
 
 def mean_cn0(log: Observations) -> Floats:
-    """Return the mean C/N0 of a receiver's observations at each epoch, shape (T,) [dB-Hz]; 0 without observations."""
+    """Return the mean C/N0 of a receiver's observations at each epoch, shape (T,) [dB-Hz]; 0 without a C/N0."""
     seen = np.isfinite(log.cn0_dbhz)
     return np.asarray(np.where(seen, log.cn0_dbhz, 0.0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1))
 

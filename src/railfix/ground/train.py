@@ -39,8 +39,8 @@ async def run_train(
 ) -> tuple[int, int]:
     """Send the newest position every second; write received authorities, and starts and ends of braking, as JSON lines.
 
-    The function returns the numbers of sent reports and of received authorities. After the last position, it ends when
-    the last report is answered, or after `ANSWER_S`.
+    The function returns the numbers of sent reports and of received authorities. After the last position, the function
+    ends when the last report is answered, or after `ANSWER_S`.
 
     The folder `keys` contains ``train-N.pem``, ``train-N.key`` and ``authority.pem``. `lines` are position messages as
     `railfix.io.train_message.to_json` writes them, by default lines of the standard input. Other lines are reported as
@@ -170,7 +170,7 @@ class _Desk:
             self._line(**authority.model_dump(), age_s=round(self._on_board.age_s(now), 3), **self._speeds(now))
 
     def _speeds(self, now_s: float) -> dict[str, float]:
-        """Return the permitted speed, its target, and the release speed; empty before the first position."""
+        """Return the permitted speed, its target, and the release speed; {} before the first position."""
         assert self._on_board is not None
         if (found := self._on_board.supervised(now_s)) is None:
             return {}
