@@ -29,7 +29,7 @@ class Wheel:
 
     @property
     def reading_sigma_m(self) -> float:
-        """Standard deviation of a reading [m]: 0, except for a counter, whose error is uniform over one pulse."""
+        """Standard deviation of a reading [m]: 0, except for a counter, with an error assumed uniform over a pulse."""
         return self.pulse_m / float(np.sqrt(12.0)) if self.pulses.kind == "count" else 0.0
 
     def distance_m(self, time: Datetimes, speed_hint_mps: Floats) -> Floats:

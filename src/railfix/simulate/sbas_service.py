@@ -257,7 +257,7 @@ class Service:
         return fast(second, values, grades, kind=2 + block, iodf=issue)
 
     def slow_messages(self) -> list[Callable[[int], Bytes]]:
-        """Return functions that make the other messages for a given second, in the order in which these are sent."""
+        """Return functions that make the other messages for a given second, in the order of sending."""
         numbers = {int(name[1:]) for name in self.satellites}
         count = len(self.satellites)
         messages: list[Callable[[int], Bytes]] = [

@@ -62,7 +62,7 @@ class ElectrificationSettings(ScenarioSettings):
 
 
 class RowSettings(ScenarioSettings):
-    """Row of walls along the line (buildings, slopes); a pair of numbers is the range of a uniform distribution."""
+    """Row of walls (buildings, slopes, mountains); a pair of numbers is the range of a uniform distribution."""
 
     sides: Sides = "both"
     distance_m: Between = (10.0, 30.0)  #: Distance of the wall from the track axis.
