@@ -44,7 +44,7 @@ class EpochOrder:
         self._break = False
 
     def ordered(self, runs: Iterable[FileEpochs]) -> Iterator[Observations]:
-        """Yield the epochs in parts, in order of time. The last part has no epochs, but the notes and counts.
+        """Yield the epochs in parts, in order of time. The last part contains only the notes and counts, no epochs.
 
         Raise InputFileError if a time tag is wrong and `broken_lines` is "stop".
         """
@@ -214,7 +214,7 @@ def _is_lone(time: Datetimes) -> Masks:
 
 
 def _merge(joined: Observations, order: Indices, repeated: Masks) -> Observations:
-    """Return the epochs with indices `order`. Repeated epochs only add values that the first with the tag lacks."""
+    """Return the epochs with indices `order`. Epochs with a repeated tag only add values that the first one lacks."""
     ordered = take_epochs(joined, order)
     if not repeated.any():
         return ordered

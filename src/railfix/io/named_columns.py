@@ -73,7 +73,7 @@ class NamedColumns:
     def numbers(self, name: str, *, blank: float | None = None) -> Floats:
         """Parse a column as numbers, shape (n,); raise InputFileError for a cell that is not a finite number.
 
-        Without `blank`, an empty cell is an error. With `blank`, empty cells are read as `blank`, and cells with
+        If `blank` is None, an empty cell is an error. Otherwise, empty cells are read as `blank`, and cells with
         ``nan`` are accepted. If `blank` is infinite, infinite cells are accepted, too.
         """
         given = self.cells[name].str.len_bytes().to_numpy() > 0

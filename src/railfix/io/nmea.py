@@ -27,7 +27,7 @@ _OTHER_LINES, _UNCHECKED = (
 )
 #: A geoid separation of 0 is reported as doubtful if the geoid is at least this far from the ellipsoid [m].
 _GEOID_M: Final = 2.0
-#: RTKLIB quality (`PositionLog.quality`) for each GGA quality indicator (NMEA 0183 4.10, field 6); 0 for others.
+#: RTKLIB quality (`PositionLog.quality`) for each GGA quality indicator (NMEA 0183 4.10, field 6); others mean 0.
 QUALITY: Final = {1: 5, 2: 4, 3: 5, 4: 1, 5: 2, 9: 3}
 
 
@@ -68,8 +68,8 @@ def read_nmea(path: FilePath, *, broken_lines: BrokenLines = "stop", date: np.da
     Returns
     -------
     PositionLog
-        Times are in GPS time. Qualities are RTKLIB numbers (`QUALITY`). A position without height or geoid separation
-        is NaN in `ecef_m`; its latitude and longitude are in `plan_deg`.
+        Times are in GPS time. Qualities are RTKLIB numbers (`QUALITY`). A position whose height or geoid separation is
+        missing is NaN in `ecef_m`; its latitude and longitude are in `plan_deg`.
 
     Raises
     ------
@@ -211,7 +211,7 @@ _DATED: Final[dict[str, Callable[[int, list[str]], _Date | None]]] = {"RMC": _rm
 
 def _times(fixes: list[_Gga], dates: list[_Date], *, chained: bool) -> Datetimes:
     """Compute the GPS time of each fix. The date is taken from the preceding RMC or ZDA sentence, corrected at
-    midnight. If `chained`, it is the first date plus one day for each midnight since.
+    midnight. If `chained` is True, the date is instead the first date plus one day for each midnight since.
     """
     of_day = np.array([fix.of_day_s for fix in fixes])
     line = np.array([fix.line for fix in fixes])

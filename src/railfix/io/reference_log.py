@@ -43,7 +43,7 @@ class AntennaReference(NotebookTable):
     ecef_m: Floats  #: Position in ECEF, shape (R, 3).
     chainage_m: Floats  #: Chainage; NaN where absent, shape (R,).
     speed_mps: Floats  #: Speed along the line, positive toward rising chainage; NaN where absent, shape (R,).
-    sigma_m: Floats  #: Standard deviation of the position along the track; NaN where absent, shape (R,).
+    sigma_m: Floats  #: Along-track standard deviation of the position; NaN where absent, shape (R,).
     source: Strings  #: Source of the position, one of `SOURCES`; shape (R,).
     environment: Strings  #: Environment such as "open"; blank where absent, shape (R,).
 

@@ -183,7 +183,7 @@ def _read_mate_table(path: FilePath, kind: str) -> pl.DataFrame:
 
 
 def _first_of_group(table: pl.DataFrame) -> pl.DataFrame:
-    """Return the rows of the first balise of each group (N_PIG = 0). Its position is used as the group's position."""
+    """Return the rows of the first balise of each group (N_PIG = 0). This balise's position is used for the group."""
     return table.filter(pl.col("N_PIG").cast(pl.Int64).fill_null(0) == 0)
 
 

@@ -17,9 +17,9 @@ from railfix.io.file_kind import wrong_kind
 
 #: Time systems that agree with GPS time to nanoseconds. SP3-a files name no time system (""); they are in GPS time.
 _GPST: Final = ("GPS", "GAL", "QZS", "CCC", "")
-#: For the name of each other time system in SP3 files, the function that converts it to GPS time.
+#: Functions that convert times in other time systems of SP3 files to GPS time, by the name of the system.
 _TO_GPST: Final = {"UTC": utc_to_gpst, "GLO": utc_to_gpst, "BDT": bdt_to_gpst, "BDS": bdt_to_gpst}
-_NO_CLOCK: Final = 999_999.0  #: Clock value from which on a clock is unknown [us]; some programs write 0 instead.
+_NO_CLOCK: Final = 999_999.0  #: Clocks of at least this magnitude are unknown [us]; some programs write 0 instead.
 
 
 def read_sp3(paths: Paths) -> PreciseEphemeris:

@@ -32,7 +32,7 @@ class MessageStatus(IntEnum):
 
     POSITION = 0  #: Position that passed every check.
     COASTING = 1  #: Position of the filter at an epoch at which satellites alone give no position.
-    DOUBTFUL = 2  #: Position that failed a check, or one of several possible positions or tracks.
+    DOUBTFUL = 2  #: Position that failed a check, or that is ambiguous: other positions or tracks are possible.
     NO_POSITION = 3  #: Observations were received, but no position was computed.
     NO_INPUT = 4  #: No input was received in this period.
     #: Satellite positioning is suspended by order of the trackside. railfix itself sends no such message.
@@ -98,14 +98,14 @@ class TrainMessage(Message):
     track_permille: Annotated[int, Field(ge=0, le=1000)] | None = None
     length_cm: Unsigned = 0  #: Length of the train; 0 if unknown.
     complete: bool = False  #: Whether the train's integrity is confirmed.
-    sigma_cm: Unsigned | None = None  #: Standard deviation of the position along the line, rounded up.
+    sigma_cm: Unsigned | None = None  #: Along-line standard deviation of the position, rounded up.
     #: Number of the newest movement authority that the train has accepted. The message acknowledges this authority.
     authority: Unsigned | None = None
     #: Chainage of the end of the movement authority, rounded away from the train.
     authority_end_cm: Signed | None = None
     interference: SuspectedInterference | None = None  #: Suspected interference; None if this is not checked.
     #: Chainages of the safe front end and safe rear end: in the direction of `facing`, no part of the train is ahead of
-    #: the safe front end or behind the safe rear end. None if bounds, front end or its direction are unknown.
+    #: the safe front end or behind the safe rear end. None if the bounds, the front end or its direction are unknown.
     safe_front_cm: Signed | None = None
     safe_rear_cm: Signed | None = None
     unknown: Unknown = Unknown(0)  #: Train properties that the sender does not know.

@@ -36,7 +36,7 @@ STAGES: Final[dict[str, tuple[str, ...]]] = {
 
 
 def digests(outputs: list[LiveOutput]) -> list[dict[str, str]]:
-    """Return, for each output, the SHA-256 digest of each stage's results and the encoded message, in hexadecimal."""
+    """Return, for each output, the encoded message and the SHA-256 digest of each stage's results, in hexadecimal."""
     return [
         {
             **{

@@ -326,7 +326,7 @@ class SensorWatch:
     def _hear(self, sensed: Sensed) -> None:
         """Store samples for the check of the sensors.
 
-        When samples cover twice `WATCHED_NS`, the sensors are checked if there is a position; then samples are dropped.
+        Samples covering over twice `WATCHED_NS` are dropped; before, the sensors are checked if there is a position.
         """
         table = bool(sensed.until == FOREVER)
         if sensed.samples and not self._judged:

@@ -237,7 +237,7 @@ class LiveEngine:
         queue.append(waiting)
 
     def _resume_at(self, tag_ns: int, saved: EngineState) -> None:
-        """Use a saved state, or only its satellite data if the new epoch is earlier or over `state_age_s` later."""
+        """Use a saved state if an epoch is at most `state_age_s` later than the state, else only its satellite data."""
         self._saved = None
         age_s = (tag_ns - saved.done_ns) / 1e9
         if 0.0 < age_s <= self.settings.state_age_s:
@@ -297,7 +297,7 @@ class LiveEngine:
 
         `now_ns` is read from the same clock as for `push`. If `sent_ns`, the GPS time of sending [ns], is given, one
         message is sent per period, for the newest epoch. Without `sent_ns`, as in a replay, every epoch has a message.
-        At `END_NS` all waiting epochs are due, and no message without input is added.
+        If `now_ns` is `END_NS`, all waiting epochs are due, and no message without input is added.
         """
         outputs = [self._process_epochs(epochs) for epochs in self._pairs(now_ns)]
         if sent_ns is None:

@@ -149,7 +149,7 @@ def forms(settings: LiveSettings) -> dict[str, Form]:
 
 
 def _geodetic(output: LiveOutput) -> tuple[float, float, float, float] | None:
-    """Return latitude, longitude [deg], ellipsoidal height and sigma [m] of the first antenna, or None."""
+    """Return latitude, longitude [deg], ellipsoidal height, sigma [m] of the first antenna; None if any is unknown."""
     place = output.place
     if place is None or place.geodetic is None or not math.isfinite(place.sigma_m):
         return None
@@ -176,7 +176,7 @@ def _sentence(body: str) -> bytes:
 
 
 def wants(form: Form, output: LiveOutput) -> bool:
-    """Return whether a form applies to an output: table forms require rows, all other forms a message."""
+    """Return whether a form applies to an output: table forms require rows, all other forms require a message."""
     return output.part != ("message" if form in ROW_FORMS.values() else "rows")
 
 

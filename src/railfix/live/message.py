@@ -20,7 +20,7 @@ from railfix.pipeline.results import AntennaResult, Result
 from railfix.pipeline.sensed_motion import CARRIED
 from railfix.tracking import Kind, TrackStatus
 
-#: The speed bound is this number of sigmas, which errors exceed with a probability of 1e-7 (two-sided, as in P1 2.4).
+#: Speed bound in sigmas. Speed errors exceed the bound with a probability of 1e-7 (two-sided, as in P1 2.4).
 _SPEED_K = 5.33
 #: Amount that is added to bounds, because chainages are rounded to centimetres [m].
 _ROUNDING_M: Final = 0.01
@@ -53,7 +53,7 @@ class TrainPlace:
 
     antenna: str  #: Antenna from which the position is computed.
     chainage_m: float  #: Chainage of the reference point [m]; NaN without a position.
-    sigma_m: float  #: Standard deviation of the position along the track [m]; NaN if unknown.
+    sigma_m: float  #: Along-track standard deviation of the position [m]; NaN if unknown.
     bound_m: float  #: Bound of the error of `chainage_m` [m]; infinite if there is none.
     level_m: float  #: Protection level from which `bound_m` is computed [m]; infinite if there is none.
     status: MessageStatus

@@ -140,8 +140,8 @@ class _Session:
     and the status last shown [s].
 
     `read_to_ns` contains, for each source that has not ended, the time [ns] up to which its epochs have been passed to
-    the engine, -1 before the first epoch. `place` is the last position as a GGA sentence, which is sent to the caster
-    of a virtual base station.
+    the engine; this time is -1 before the first epoch. `place` is the last position as a GGA sentence, which is sent to
+    the caster of a virtual base station.
     """
 
     engine: LiveEngine
@@ -151,13 +151,13 @@ class _Session:
     streams: dict[str, ReceiverState] = field(default_factory=dict)
     read_to_ns: dict[str, int] = field(default_factory=dict)
     place: bytes = b""
-    #: Function that returns the time of sending, GPS time since 1980 [ns]. This is the time of the computer or, in a
-    #: paced replay, the time of the recording.
+    #: Function that returns the time of sending, GPS time since 1980 [ns]. The time is the computer's or, in a paced
+    #: replay, the recording's.
     clock: Callable[[], int] = field(default_factory=lambda: gps_now_ns)
     saved: float = field(default_factory=time.monotonic)
     shown: float = 0.0
     reserved_from: int = 0
-    #: For the name of each sink that could not be written, the error.
+    #: Error of each sink that could not be written, by the sink's name.
     ended: dict[str, OutputError] = field(default_factory=dict)
 
     async def process(self, queue: _Queue, pumps: list[asyncio.Task[None]], *, replay: bool) -> None:
@@ -256,10 +256,10 @@ class _Session:
             _LOG.info("%s: connected to %s%s", name, hidden(source), again)
 
     def take(self, name: str, received: ReceivedData, now_ns: int | None) -> int:
-        """Pass the items decoded from one source to the engine; return the time tag [ns] of the last epoch, -1 without
-        epochs.
+        """Pass the items decoded from one source to the engine; return the last epoch's time tag [ns], or -1 if there
+        are no epochs.
 
-        Without `now_ns`, the time tag of an epoch is used as its time of arrival.
+        If `now_ns` is None, the time tag of an epoch is used as its time of arrival.
         """
         self.streams[name] = received.after
         skipped = self.metrics.skipped

@@ -92,7 +92,7 @@ class Outlet(Generic[Item]):
             raise OutputError(f"{self.name}: {self.failure}")
 
 
-#: A client of a TCP sink for which more than this number of bytes wait is disconnected.
+#: A client of a TCP sink is disconnected if more than this number of bytes wait for the client.
 _LARGEST_BACKLOG: Final = 1 << 20
 _ANSWER_S: Final = 10.0  #: A connection that an MQTT broker has not accepted after this time has failed [s].
 #: When an MQTT target is closed, messages that are not sent within this time are lost [s].

@@ -25,11 +25,11 @@ class Ends(NamedTuple):
     If the running direction is unknown, each end may be on either side of the reference point.
     """
 
-    #: Position of the front end, positive ahead of the reference point; the middle if several are possible.
+    #: Position of the front end, positive ahead of the reference point; the middle of all possible positions.
     front_m: float
-    spread_m: float  #: Largest distance of a possible position of the front end from `front_m`.
-    foremost_m: float  #: Distance from the reference point to the farthest part of the train that may be ahead of it.
-    rearmost_m: float  #: Distance from the reference point to the farthest part of the train that may be behind it.
+    spread_m: float  #: Largest distance between `front_m` and a possible position of the front end.
+    foremost_m: float  #: Largest distance by which the train may extend ahead of the reference point.
+    rearmost_m: float  #: Largest distance by which the train may extend behind the reference point.
 
 
 @dataclass(frozen=True, kw_only=True)

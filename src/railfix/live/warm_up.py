@@ -33,8 +33,8 @@ from railfix.tracking.limits import TrackingLimits
 from railfix.tracking.line import Line
 from railfix.tracking.state import TrackState
 
-#: Settings, each with the number of epochs to process with them. Together, they call all single-epoch kernels except
-#: the kernels in `_look_beyond`. The second settings leave too few satellites for 3-D positions.
+#: Groups of settings, each with the number of epochs to process. Together, the groups call all single-epoch kernels
+#: except the kernels in `_look_beyond`. The second group leaves too few satellites for 3-D positions.
 _SINGLE_EPOCHS: Final[tuple[tuple[dict[str, Any], int], ...]] = (
     ({"filter": "off"}, 60),
     ({"filter": "off", "systems": ["G"], "elevation": {"mask_deg": 45.0}, "protection": "off"}, 5),

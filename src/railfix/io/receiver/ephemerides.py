@@ -44,8 +44,8 @@ from railfix.io.rinex.navigation_records import RawRecord, first_fault, glonass_
 
 #: Constellation letter for each number of an RTCM ephemeris message.
 _RTCM_SYSTEMS: Final = {1019: "G", 1044: "J", 1042: "C", 1045: "E", 1046: "E", 1020: "R"}
-_STRINGS_S: Final = 15.0  #: The epochs before GLONASS strings 2 to 4 must be less than this after the frame start [s].
-#: The epochs before GLONASS strings 2 to 4 must be less than this before the frame start [s].
+_STRINGS_S: Final = 15.0  #: Epochs before GLONASS strings 2 to 4 may follow the frame start by less than this [s].
+#: Epochs before GLONASS strings 2 to 4 may precede the frame start by less than this [s].
 _EPOCH_BEFORE_S: Final = 5.0
 _FRAME_S: Final = 30.0  #: Duration of a GLONASS frame [s].
 
@@ -317,8 +317,8 @@ class _EphemerisBuilder:
         if self.needs_date(satellite, time):
             return None
         # All strings must be of one frame, which begins at the time t_k in string 1; one string is sent every 2 s. The
-        # time of string 1 is not tested, because it may precede the receiver's first epoch. If the test fails, as with
-        # rare epochs, the first epoch after the strings is tested: it must be within one frame length of t_k.
+        # time of string 1 is not tested, because it may precede the receiver's first epoch. If the test fails, as it
+        # does where epochs are rare, the first epoch after the strings must be less than one frame length after t_k.
         began = frame_time(parts[0], time)
         if within is None:
             received = np.array([part["received"] for part in parts[1:]]).astype(np.int64).astype("datetime64[ns]")

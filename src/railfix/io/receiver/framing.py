@@ -88,7 +88,7 @@ class _FrameCandidates:
 
 
 def find_frames(data: Bytes, *, at_end: bool = True) -> Frames:
-    """Find the frames in a buffer of bytes. An incomplete last frame is skipped if `at_end`, else not consumed."""
+    """Find the frames in a buffer. An incomplete last frame is skipped if `at_end` is True, else not consumed."""
     data = np.asarray(data, dtype=np.uint8)
     candidates = [_ubx(data), _rtcm(data), _sbf(data), _nmea(data, at_end=at_end)]
     incomplete = [c.frame[c.frame_end > len(data)] for c in candidates]

@@ -96,7 +96,7 @@ def _messages(frames: Frames) -> Iterator[tuple[int, int, int, float]]:
 
 
 def _mon_rf(data: Bytes) -> tuple[int, float] | None:
-    """Return the jamming bit, set if any band is jammed, and the gain of the first band; None if malformed."""
+    """Return the jamming bit, set if any band is jammed, and the first band's gain, or None for a malformed message."""
     if len(data) < 4 + _BLOCK or len(data) != 4 + _BLOCK * int(data[1]):
         return None
     blocks = data[4:].reshape(-1, _BLOCK)
@@ -105,7 +105,7 @@ def _mon_rf(data: Bytes) -> tuple[int, float] | None:
 
 
 def _mon_hw(data: Bytes) -> tuple[int, float] | None:
-    """Return the jamming bit and the gain (receivers up to the M8 generation); None if malformed."""
+    """Return the jamming bit and the gain (receivers up to the M8 generation), or None for a malformed message."""
     if len(data) != _MON_HW_BYTES:
         return None
     return JAMMING * ((int(data[22]) >> 2 & 3) >= _CERTAIN), float(data[18]) + 256.0 * float(data[19])
@@ -149,7 +149,7 @@ def _rf_status(data: Bytes) -> tuple[int, float] | None:
 
 
 def _receiver_status(data: Bytes) -> tuple[int, float] | None:
-    """Return the gain of the first front end [dB], NaN if unavailable; None if malformed."""
+    """Return 0 (no alarm) and the first front end's gain [dB], NaN if unavailable, or None for a malformed block."""
     if len(data) < _FRONT_ENDS or int(data[20]) < 1 or len(data) < _FRONT_ENDS + int(data[21]):
         return None
     gain = int(data[_FRONT_ENDS + 1 : _FRONT_ENDS + 2].view(np.int8)[0])
@@ -382,7 +382,7 @@ _SAME_WEEK: Final = np.timedelta64(5, "D")  #: A `date` further than this from t
 
 
 def _week_of_log(path: FilePath, date: np.datetime64 | None) -> np.datetime64:
-    """Return the time of an RTCM 3 log's first ephemerides; without ephemerides, `date`; without both, NaT."""
+    """Return the time of an RTCM 3 log's first ephemerides. If it has none, return `date`, or NaT if `date` is None."""
     own: np.datetime64 = np.datetime64("NaT", "ns")
     rest = b""
     with open_stream(path, content="bytes") as stream:

@@ -46,7 +46,7 @@ class Measurements:
     leap_seconds: int | None = None
     receiver: str = ""
     skipped: Mapping[str, int] = field(default_factory=dict)
-    #: `Observations.receiver_alarm` and `Observations.front_end_gain` at each epoch, shape (T,); None if not sent.
+    #: `Observations.receiver_alarm` and `Observations.front_end_gain` by epoch, shape (T,); each None if not sent.
     alarm: Bytes | None = None
     gain: Floats | None = None
 
@@ -112,7 +112,7 @@ def join_observations(measurements: Measurements, tracking: Tracking | None = No
 
 
 def _at_epochs(values: NDArray[Any] | None, rising: Masks, absent: float) -> NDArray[Any]:
-    """Return the values at the accepted epochs; if `values` is None, `absent` at every epoch."""
+    """Return the values at the accepted epochs. If `values` is None, every value is `absent`."""
     kind = np.float64 if np.isnan(absent) else np.uint8
     return np.full(int(rising.sum()), absent, dtype=kind) if values is None else values[rising]
 
@@ -129,7 +129,7 @@ def _tracking_after(
 
 
 def rising_epochs(time: Datetimes, after: np.datetime64 | None = None) -> Masks:
-    """Return whether each epoch is later than all preceding epochs and than `after`, shape (T,)."""
+    """Return whether each epoch is later than all preceding epochs and later than the time `after`, shape (T,)."""
     ns = time.astype(np.int64)
     floor = np.iinfo(np.int64).min if after is None else int(after.astype("datetime64[ns]").astype(np.int64))
     before = np.concatenate([[floor], np.maximum(np.maximum.accumulate(ns), floor)[:-1]]) if len(ns) else ns
@@ -190,7 +190,7 @@ def join_measurements(parts: Sequence[Measurements]) -> Measurements:
     )
 
 
-#: Navigation record and its issue, which are the values that distinguish it from other records of the satellite.
+#: Navigation record, and its issue: the values that distinguish the record from other records of the satellite.
 Record = tuple[RawRecord, tuple[float, ...]]
 
 _GALILEO_WEEK_MINUS_GPS: Final = 1024

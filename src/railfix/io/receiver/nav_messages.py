@@ -179,8 +179,8 @@ _BCNAV1_CODINGS: Final[dict[str, Coding]] = {
     "inter_signal_0": (12, 2.0**-34, "s"),
 }
 BCNAV1_WITH_HEALTH: Final = (1, 2, 3, 4)  #: Page types of B-CNAV1 subframe 3 that begin with the health status.
-#: For each of the three pages into which railfix divides a B-CNAV1 frame, the subframe that has its data bits, their
-#: first bit, and their end. In a page, the data bits follow PRN, page number and SOW.
+#: For each of the three pages into which railfix divides a B-CNAV1 frame: the subframe that has the page's data bits,
+#: and the first bit and the end of these bits. In a page, the data bits follow PRN, page number and SOW.
 BCNAV1_PARTS: Final = ((2, 0, 275), (2, 275, 569), (3, 0, 15))
 BCNAV1_HEAD: Final = layout(_BCNAV1_CODINGS, number=0, tow_s=8)
 BCNAV1: Final = _with_head(BCNAV1_HEAD, {
@@ -322,10 +322,10 @@ E5A_SOURCE: Final = 1 << 1 | 1 << 8
 _UBX_E5B: Final = (5, 6)
 _UBX_E5A: Final = (3, 4)
 _CNAV_SIGNALS: Final = {"G": (3, 4, 6, 7), "J": (4, 5, 8, 9)}  #: UBX numbers of the signals with CNAV, L2C and L5.
-#: UBX numbers of the BeiDou signals that carry D1 or D2, B-CNAV1 (B1C), and B-CNAV2 (B2a).
+#: UBX numbers of the BeiDou signals that carry D1 or D2, of B1C (B-CNAV1), and of B2a (B-CNAV2).
 _D_SIGNALS, _B1C, _B2A = (0, 1, 2, 3, 4, 10), (5, 6), (7, 8)
-#: Offsets added to the numbers of F/NAV pages, CNAV and B-CNAV2 messages, and B-CNAV1 pages, so that the page numbers
-#: of a satellite are unique.
+#: Offsets added to the numbers of F/NAV pages, of CNAV and B-CNAV2 messages, and of B-CNAV1 pages, so that the page
+#: numbers of a satellite are unique.
 FNAV_FROM, CNAV_FROM, BCNAV1_FROM = 200, 300, 400
 _PREAMBLE: Final = 0x8B
 Pages = Iterator[tuple[int, int, Values]]  #: Items: row in `Subframes`, page number and fields of a page.
@@ -361,7 +361,7 @@ def _of_kinds(
 def _with_crc(
     part: Subframes, here: Masks, checked: int, counts: Counter[str], fault: str, preamble: int | None = None
 ) -> tuple[Bytes, Masks]:
-    """Return the bits of all pages, and whether each is selected by `here` and valid; count selected invalid pages."""
+    """Return all pages' bits, and whether each page is selected by `here` and valid; count selected invalid pages."""
     bits = unpack_words(part.words, drop=0, keep=32)
     if not here.any():
         return bits, here

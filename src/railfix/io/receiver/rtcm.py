@@ -69,7 +69,7 @@ def _lock_table(bits: int) -> Floats:
 class ChannelNews(NamedTuple):
     """GLONASS frequency channels in order of reception, N rows."""
 
-    place: Indices  #: Offset of the message in the stream, shape (N,); -1 for channels known before.
+    place: Indices  #: Offset of the message in the stream, shape (N,); -1 for channels known from an earlier piece.
     number: Integers  #: GLONASS slot number, shape (N,).
     channel: Integers  #: Frequency channel of the satellite, shape (N,).
 
@@ -88,7 +88,7 @@ class ChannelNews(NamedTuple):
 
 
 def glonass_channels(frames: Frames, before: Mapping[int, int]) -> ChannelNews:
-    """Return the channels in `before` and in messages 1020. MSM4 and MSM6, which contain no channels, need them."""
+    """Return the channels in the mapping `before` and in messages 1020, for MSM4 and MSM6, which have no channels."""
     chosen = frames.of("rtcm3", 1020)
     bits = take_bits(frames, chosen, 23)
     known = (np.full(len(before), -1), *np.array([*before.items()], dtype=np.int64).reshape(-1, 2).T)
@@ -156,7 +156,7 @@ def _beidou_time(time: Datetimes, letter: Strings) -> tuple[Datetimes, int]:
 
 
 def _in_rising_weeks(time: Datetimes, glonass: Masks) -> Datetimes:
-    """Shift each time by weeks to within half a week of the one before; GLONASS times only if there are no others."""
+    """Shift times by weeks to within half a week of the previous time; GLONASS times only if all are GLONASS times."""
     counted = np.flatnonzero(~glonass) if not glonass.all() else np.arange(len(time))
     week = np.timedelta64(7, "D").astype("timedelta64[ns]")
     moved = time.copy()
@@ -368,7 +368,7 @@ def ephemeris_fields(frames: Frames) -> Iterator[tuple[int, int, dict[str, float
             yield place, number, {name: float(values[k]) for name, values in table.items()}
 
 
-#: For the week field of each ephemeris message, the GPS week in which it was first 0, and its cycle [weeks].
+#: For the week field of each ephemeris message, the GPS week in which the field was first 0, and its cycle [weeks].
 _WEEKS: Final = {1045: (1024, 4096), 1046: (1024, 4096), 1042: (1356, 8192), 1019: (0, 1024), 1044: (0, 1024)}
 
 
@@ -377,12 +377,12 @@ _FIRST_MSM_WEEK: Final = 1642
 
 
 def ephemeris_date(frames: Frames, near: np.datetime64 | None) -> np.datetime64:
-    """Return the median time of a log's ephemerides, from which the week of its observations is resolved, or NaT.
+    """Return the median time of a log's ephemerides, to resolve the week of the observations; NaT without ephemerides.
 
-    Only Galileo ephemerides are used or, if there are none, BeiDou ephemerides, whose weeks are also unambiguous, else
-    GPS and QZSS ephemerides. These have the week modulo 1024, which is resolved to the week nearest to `near`; without
-    `near`, to the only such week from July 2011, when MSM were introduced, to February 2031. The computer's clock is
-    not used.
+    Only Galileo ephemerides are used. If there are none, only BeiDou ephemerides are used, and otherwise GPS and QZSS
+    ephemerides. GPS and QZSS weeks are ambiguous (modulo 1024): the week nearest to `near` is used or, if `near` is
+    None, the only possible week from July 2011, when MSM were introduced, to February 2031. The computer's clock is not
+    used.
     """
     cycle_begin = _FIRST_MSM_WEEK
     if near is not None:

@@ -327,7 +327,7 @@ def _inav_words(words: Words) -> Words:
 
 
 def positions(frames: Frames) -> dict[str, np.ndarray]:
-    """Return the positions in PVTGeodetic blocks, or else in PVTCartesian blocks, as columns of `PositionLog`."""
+    """Return the positions in PVTGeodetic or, if there are none, PVTCartesian blocks, as columns of `PositionLog`."""
     geodetic = len(frames.of("sbf", PVT_GEODETIC)) > 0
     _, rows = frames.structures("sbf", [PVT_GEODETIC if geodetic else PVT_CARTESIAN], _PVT)
     mode = rows["mode"] & 15

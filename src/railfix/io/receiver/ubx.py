@@ -191,7 +191,7 @@ def positions(frames: Frames, near: np.datetime64) -> dict[str, np.ndarray]:
         horizontal, vertical = rows["horizontal"] * 1e-4, rows["vertical"] * 1e-4
         by_tow = dict(zip(pvt["tow_ms"].tolist(), np.where(fixed, quality, -1).tolist(), strict=True))
         quality = np.array([by_tow.get(tow, 5) for tow in rows["tow_ms"].tolist()], dtype=np.int64)
-        kept &= quality > 0  # drop positions before the first fix, which NAV-PVT marks as invalid
+        kept &= quality > 0  # drop the positions before the first fix; NAV-PVT marks them as invalid
     else:
         rows, kept = pvt, fixed
         latitude, longitude = rows["latitude"] * 1e-7, rows["longitude"] * 1e-7

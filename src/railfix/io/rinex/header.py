@@ -82,7 +82,7 @@ def read_header_bytes(stream: ByteStream) -> tuple[list[str], bytes]:
 
 
 def parse_header(path: str, lines: Sequence[str], *, log: FaultLog, first_line: int = 1) -> RinexHeader:
-    """Parse the header `lines` of an observation file; `first_line` is the line number of the first.
+    """Parse the header `lines` of an observation file; `first_line` is the line number of the first line.
 
     `log` receives notes on misaligned and on skipped records. Raise InputFileError if the header cannot be used.
     """

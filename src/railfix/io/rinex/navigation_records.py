@@ -50,7 +50,7 @@ FIELDS: Final[Mapping[str, Sequence[str]]] = {
     "R": _GLONASS,
     **{message: names.split() for message, names in _MESSAGES_4.items()},
 }
-#: Numbers without which orbit or clock cannot be computed; a record in which one is blank is rejected.
+#: Numbers needed to compute orbit and clock; a record in which one of these numbers is blank is rejected.
 _NEEDED: Final = frozenset(
     "af0_s sqrt_a eccentricity m0 toe_sow_s omega0 i0 omega omega_dot "
     "clock_bias x x_velocity y y_velocity z z_velocity".split()
@@ -203,7 +203,7 @@ def _integers(values: Floats) -> Integers:
 
 
 def _messages(raw: Sequence[RawRecord], system: Strings, source: Integers, satellite: Strings) -> Strings:
-    """Return the message names; if a record has none, from the Galileo data source or the BeiDou satellite number."""
+    """Return the message names; missing names follow from the Galileo data source or the BeiDou satellite number."""
     number = np.array([int(s[1:]) for s in satellite.tolist()], dtype=np.int64)
     geo = (number <= 5) | (number >= 59)
     fnav = ((source & 0b010) != 0) & ((source & 0b101) == 0)
@@ -215,7 +215,7 @@ def _messages(raw: Sequence[RawRecord], system: Strings, source: Integers, satel
 
 
 def _fit_interval(system: Strings, fit: Floats) -> Floats:
-    """Return the fit interval [h] of GPS (0 means 4 h, 1 means 6 h) and QZSS (0 means 2 h, 1 means 4 h), else NaN."""
+    """Return the fit interval [h]: GPS (0 means 4 h, 1 means 6 h), QZSS (0 means 2 h, 1 means 4 h), NaN for others."""
     fit = np.nan_to_num(fit)
     gps = np.where(fit == 0, 4.0, np.where(fit == 1, 6.0, fit))
     qzss = np.where(fit == 0, 2.0, np.where(fit == 1, 4.0, fit))

@@ -28,7 +28,7 @@ _WRITTEN: Final[dict[RinexVersion, tuple[str, ...]]] = {
     "4.02": ("LNAV", "INAV", "FNAV", "D1", "D2", "CNV1"),
 }
 _BLANK: Final = " " * 19
-#: Last line of a version 4 GLONASS record (flags, group delay, accuracy): unknown, as `GlonassRecords` lacks these.
+#: Last line of a version 4 GLONASS record: unknown flags, group delay and accuracy (not in `GlonassRecords`).
 _GLONASS_STATUS: Final = f"    {_BLANK}{'.999999999999E+09':>19}{_BLANK}{_BLANK}".rstrip() + "\n"
 
 
@@ -44,7 +44,7 @@ def write_navigation(
     """Write a RINEX navigation file; a failed write leaves no file.
 
     Records are sorted by clock time, then satellite. NaN is written as blank, and the L2 P data flag as 0. Unknown
-    transmission times, and CNV1 fields that `Navigation` lacks, are written as 0.9999E9. `precise` is not written.
+    transmission times, and CNV1 fields that `Navigation` lacks, become 0.9999E9. The field `precise` is not written.
 
     Parameters
     ----------

@@ -68,7 +68,7 @@ def read_fields(
 
     The value of a blank or bad field is NaN, and its digit is 0. A field is bad if it is neither blank nor a number, or
     if one of its two indicators is neither blank nor a digit. `index` is the field number of each type, and `divisor`
-    its scale factor (SYS / SCALE FACTOR), shape (k,) each. The other arguments are as in `gather`.
+    the type's scale factor (SYS / SCALE FACTOR), shape (k,) each. The other arguments are as in `gather`.
     """
     value, lock, odd = kernels.reading.decode_fields(data, start, length, index, divisor)
     bad = np.zeros(value.shape, dtype=np.bool_)

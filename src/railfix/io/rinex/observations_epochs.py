@@ -76,7 +76,7 @@ class FaultLog:
         self.remark(message)
 
     def remark(self, message: str) -> None:
-        """Store `message`, with file and line, about an error in the format that causes no loss of data."""
+        """Store `message`, with file and line, about a format error that causes no loss of data."""
         self._problems += 1
         if len(self._messages) < MAX_PROBLEMS:
             self._messages.append(message)
@@ -132,7 +132,7 @@ def find_epochs(
 ) -> tuple[EpochHeads, int]:
     """Return the complete epochs and events in a block, and the number of lines that were read.
 
-    The last epoch may be incomplete. It is left for the next block, except at the end of the file (`at_end`).
+    The last epoch, which may be incomplete, is left for the next block, except at the end of the file (`at_end`).
     """
     if version >= 3.0:
         return _find_marked(lines, version=version, at_end=at_end, log=log)
@@ -183,7 +183,7 @@ def _find_marked(lines: Lines, *, version: float, at_end: bool, log: FaultLog) -
 
 
 def _records_after(lines: Lines, head: EpochHeads, room: Integers, log: FaultLog) -> dict[int, tuple[int, int, int]]:
-    """Return, for the index of each epoch that header records follow, these records as an event (line, flag, count)."""
+    """Return, by epoch index, the header records that follow an epoch, joined to one event (line, flag, count)."""
     records: dict[int, tuple[int, int, int]] = {}
     for k in np.flatnonzero((head.flaw == 0) & (room > head.count)).tolist():
         first, end = int(head.line[k] + 1 + head.count[k]), int(head.line[k] + 1 + room[k])

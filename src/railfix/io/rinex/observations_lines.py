@@ -29,7 +29,7 @@ class Lines:
     data: Bytes  #: Text of the block, followed by blanks, because fixed columns may extend beyond the last line.
     start: Integers  #: Offset of each line in `data`, shape (n,).
     length: Integers  #: Length of each line without the line end (LF or CR LF), shape (n,).
-    stop: Integers  #: Offset in `data` of the first character after each line, shape (n,).
+    stop: Integers  #: Offset in `data` of the first character after each line and its LF, shape (n,).
     number: Integers  #: Line number of each line in the decompressed file, from 1; shape (n,).
 
     def __len__(self) -> int:
@@ -56,7 +56,7 @@ class Lines:
 
 
 def split_lines(text: bytes, *, first_number: int, keep_blank: bool) -> Lines:
-    """Split a block, which ends with `PADDING` blanks, into lines. Empty lines are kept if `keep_blank` (RINEX 2)."""
+    """Split a block, which ends with `PADDING` blanks, into lines. `keep_blank` keeps empty lines (RINEX 2)."""
     data = np.frombuffer(text, dtype=np.uint8)
     end = kernels.reading.line_ends(data)
     start = np.concatenate([np.zeros(min(len(end), 1), dtype=np.int64), end[:-1] + 1])
