@@ -204,7 +204,7 @@ def _system(crs: str) -> CRS:
 
 
 def find_crs(crs: str, *, path: FilePath = "") -> CRS:
-    """Return the CRS that has a given name; raise SettingsError that states `path` if PROJ does not know the name."""
+    """Return the CRS that has a given name; raise SettingsError, whose text has `path`, for a name unknown to PROJ."""
     try:
         return _system(crs)
     except CRSError:

@@ -27,7 +27,7 @@ _CORNER_RAD: Final = 0.25  #: Change of direction above which a point is a corne
 #: A ramp's end is inserted only if it is farther from both neighbouring points than this fraction of the distance
 #: between them.
 _BREAK_SHARE: Final = 1e-3
-#: A ramp's end is inserted only if the change of slope times the distance between its neighbours exceeds this.
+#: A ramp's end is inserted only if the change of slope, times the distance between both neighbours, exceeds this.
 _LEAST_BREAK: Final = 1e-4
 _CHORD_M: Final = 2e-3  #: Largest distance of the curve from the chords of `curved_line` [m].
 

@@ -114,7 +114,7 @@ class Stations:
     #: start of the alignment, the station just before the jump, and the station just after the jump [m].
     rows: tuple[tuple[float, float, float], ...]
     last_sign: float = 1.0  #: 1 if the stations rise after the last row, -1 if they fall.
-    jump_m: float = 0.05  #: A jump of the kilometrage is spread over this distance before and after it.
+    jump_m: float = 0.05  #: A jump of the kilometrage is spread over this distance before and after the jump.
 
     @property
     def places_m(self) -> Floats:
@@ -296,7 +296,7 @@ def alignment_points(
     return alignment_at(place, plan, profile, cant), notes
 
 
-#: An alignment is rejected if its profile leaves out more than this [m]; otherwise the outermost gradients continue.
+#: An alignment is rejected if more than this length has no profile [m]; otherwise the outermost gradients continue.
 _PROFILE_BEYOND_M: Final = 50.0
 
 

@@ -85,8 +85,8 @@ class MapMotion(TypedDict, total=False):
     epoch: float | None  #: Epoch of the map's coordinates, for a frame that is an ITRF realisation [year].
     plate: str | None  #: Plate, one of `PLATES`, with which ITRF coordinates move from `epoch` to the time of the log.
     #: Parameter file of Japan's semi-dynamic correction (``SemiDynaEXE`` format). The correction transforms JGD2011 to
-    #: the epoch of the file, including crustal deformation. If a file is given, `epoch` is its epoch; from then on, the
-    #: plate motion is used.
+    #: the epoch of the file, including crustal deformation. If a file is given, `epoch` is the epoch of the file; after
+    #: this epoch, the plate motion is used.
     parameters: FilePath | None
 
 
@@ -240,7 +240,7 @@ def _realisation_note(frame: CRS, operation: Transformer) -> tuple[str, ...]:
 def _by_parameters(
     ecef_m: Floats, path: FilePath, year: float, epoch: float | None, plate: str
 ) -> tuple[Floats, str, tuple[str, ...]]:
-    """Transform JGD2011 coordinates to the epoch of a semi-dynamic correction, and then by plate motion.
+    """Transform JGD2011 coordinates to the epoch of a semi-dynamic correction, then by plate motion to `year`.
 
     The correction is computed once for each cell of 0.001 deg. Raise InputFileError if the file is not valid or does
     not cover the map.

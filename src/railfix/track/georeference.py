@@ -273,7 +273,7 @@ def _check_area(crs: str, latitude_deg: Floats, longitude_deg: Floats, *, path: 
 
 @lru_cache(maxsize=64)
 def _bounds(crs: str) -> Box:
-    """Return the area of use of a CRS's geodetic frame, extended by `MARGIN_DEG`; an empty box if it has no area."""
+    """Return the area of use of a CRS's geodetic frame, extended by `MARGIN_DEG`; an empty box if unknown."""
     area = get_geodetic_frame(crs).area_of_use
     if area is None:
         return (np.inf, -np.inf, np.inf, -np.inf)

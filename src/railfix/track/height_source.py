@@ -31,7 +31,7 @@ RASTERS: Final = (
     ".tif", ".tiff", ".asc", ".vrt", ".hgt", ".dt0", ".dt1", ".dt2", ".img", ".bil", ".flt", ".jp2", ".grd", ".xyz",
 )  # fmt: skip
 HeightSource = FilePath | PositionLog  #: File with heights, or positions in memory.
-_SPACING_M: Final = 50.0  #: Points are added where those of the map are farther apart than this [m].
+_SPACING_M: Final = 50.0  #: Points are added where the points of the map are farther apart than this [m].
 _WINDOW_CELLS: Final = 4_000_000  #: Largest number of raster cells that are read at once.
 _NEAR_M: Final = 15.0  #: Positions farther than this from the line in plan are not used [m].
 #: Every point of the map needs a position of the log within this distance along the line [m].

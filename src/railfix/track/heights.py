@@ -205,9 +205,9 @@ def heights_of_file(
 def own_height_datum(
     crs: str | None, height_datum: str | None, geoid: str | None, *, path: str
 ) -> tuple[str | None, str | CRS | None]:
-    """Return the height datum and the geoid of the user or of a compound CRS; None if neither states them.
+    """Return height datum and geoid, from the user or a compound CRS; each is None if neither of the two states it.
 
-    Raise SettingsError if the two contradict each other.
+    Raise SettingsError if user and CRS contradict each other.
     """
     vertical = get_vertical_datum(crs)
     if vertical is None:

@@ -199,7 +199,7 @@ def _map_conversion(
 ) -> tuple[tuple[float, float, float, float, float, float] | None, str | None]:
     """Return easting, northing, height [m], cosine, sine and scale of the IfcMapConversion, and the name of its CRS.
 
-    Both results are None without an IfcMapConversion. Raise InputFileError if the scale does not match the units.
+    Without IfcMapConversion, numbers and name are None. Raise InputFileError if the scale does not match the units.
     """
     found = step.of_kind("IFCMAPCONVERSION")
     if not found:
@@ -220,7 +220,7 @@ def _map_conversion(
 
 
 def _place(step: _Step, alignment: _Entity, layout: _Entity, scale: float) -> _Placement:
-    """Return the placement of an alignment, or of its horizontal layout if the layout is placed relative to it."""
+    """Return the placement of an alignment, or of its horizontal layout if that is placed relative to the alignment."""
     own, relative = alignment.values[5], layout.values[5]
     if relative is not None and own is not None and own in _chain(step, relative):
         own = relative

@@ -54,7 +54,7 @@ class ThinningLimits(Settings):
     #: Horizontal speed below which the antenna counts as stationary. Positions at standstill are dropped, because their
     #: changes are noise or drift. This limit requires times. With 0, all positions are kept.
     standing_mps: float = Field(default=0.2, ge=0)
-    #: Distance between consecutive points above which they are reported as a gap.
+    #: Distance between consecutive points above which a gap is reported.
     jump_m: float = Field(default=50.0, gt=0)
     gap_m: float = Field(default=2000.0, gt=0)  #: Longest gap that is bridged; a longer gap is an error.
     #: Largest speed of the vehicle. Positions that can be reached only at a higher speed are dropped. If times are

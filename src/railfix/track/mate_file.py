@@ -102,7 +102,7 @@ def _rows(path: FilePath, table: str | None) -> dict[str, list[Row]]:
     """Return the rows of each edge, sorted by distance from the start of the edge.
 
     If `table` is None, the rows are from the file `path`, otherwise from the file of this table in the same folder. The
-    result is empty if that file is missing.
+    result is empty if the file of `table` is missing.
     """
     file = Path(path)
     if table is not None:
@@ -195,7 +195,7 @@ def _forms(path: str, row: Row) -> list[PlanElement]:
 
 
 def _element(x: float, y: float, azimuth: float, first: float, last: float, length: float) -> PlanElement:
-    """Create an element, whose angles are counter-clockwise from east, from clockwise azimuth and curvature."""
+    """Convert clockwise azimuth and curvatures to an element, whose angles are counter-clockwise from east."""
     direction = np.pi / 2.0 - azimuth
     return PlanElement(x_m=x, y_m=y, direction_rad=direction, first=-first, last=-last, length_m=length)
 

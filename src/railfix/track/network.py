@@ -32,7 +32,7 @@ ANTENNA_UP_M: Final = 2.5  #: Assumed height of an antenna above the rails [m].
 #: Standard deviation of the assumed antenna height [m]; some antennas are on bogies, others on roofs.
 ANTENNA_SIGMA_M: Final = 1.5
 _DIRECTION_M: Final = 10.0  #: Length over which the direction of a track at its end is computed [m].
-#: Routes of up to this length are searched first [m]; the whole network is searched if there is none.
+#: Routes of up to this length are searched first [m]; the whole network is searched if there is no such route.
 _NEAR_WAY_M: Final = 5_000.0
 _SAMPLE_M: Final = 50.0  #: Largest spacing of the samples in the spatial index [m].
 #: Number of nearest samples that are examined first for each position; more samples are examined if these are not

@@ -5,7 +5,7 @@ or unmapped track near the position, and a value of the common error. The common
 process in each of the directions east, north and up, on a lattice (Ehrenfest's urn; Kac 1947, doi:10.2307/2304386). The
 remaining error of each position has heavy tails (Student's t) and a correlation time `correlation_s`; the log
 likelihood of a position is weighted with the fraction of this time that the position represents. An unmapped track is
-parallel to the nearest track at a constant distance (`SHIFTS_M`) and clear of all other tracks, or it can be anywhere.
+anywhere, or it is parallel to the nearest track at a constant distance (`SHIFTS_M`) and clear of all other tracks.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _BEYOND_SIGMAS: Final = 5.0
 _BEYOND_M: Final = (CLEARANCE_M, 10.0)
 _ROUNDED_M: Final = 1e-6
 #: A transition is possible if the path exceeds the straight distance between two positions by at most this length [m]
-#: plus `_SLACK_SHARE` times the straight distance. The path is longer than this distance in bends.
+#: plus `_SLACK_SHARE` times the straight distance. In bends, the path is longer than the straight distance.
 _SLACK_M: Final = 30.0
 #: Fraction of the straight distance; see `_SLACK_M`.
 _SLACK_SHARE: Final = 0.2
@@ -73,13 +73,13 @@ class Residuals:
 
     across: Floats  #: Unit vector to the right of the track, east and north, shape (n, m, 2).
     offset_m: Floats  #: Distance of the position to the right of the track, shape (n, m); infinite without a candidate.
-    beyond_m: Floats  #: Distance of the position beyond an end of the track, shape (n, m); 0 if not beyond.
+    beyond_m: Floats  #: Distance beyond an end of the track, shape (n, m): negative at the start, 0 between ends.
     above_m: Floats  #: Height of the position above the expected antenna height, shape (n, m); NaN without a height.
     #: Whether an unmapped track at a distance `SHIFTS_M` from the nearest track is clear of all tracks, shape (n, S).
     clear: Masks
-    #: Distance of the nearest track to the right of the previous position's nearest track, shape (n,).
+    #: Distance from the previous position's nearest track to the nearest track, positive to the right, shape (n,).
     moved_m: Floats
-    #: Whether the nearest track has a direction opposite to the previous position's nearest track, shape (n,).
+    #: Whether the nearest track and the previous position's nearest track have opposite directions, shape (n,).
     turned: Masks
     sigma_m: Floats  #: Standard deviation of a position per horizontal axis, shape (n,).
     sigma_up_m: Floats  #: Standard deviation of the height, shape (n,).
@@ -104,7 +104,7 @@ class Transitions:
         to_end = np.fmin(self._place, self._rest)
         #: Whether the train can reach an end of the track from the position before a transition, shape (n - 1, m).
         self._leaves = to_end[:-1] <= self._reach[:, None]
-        #: Whether the train can reach the position after a transition from an end of the track, shape (n - 1, m).
+        #: Whether the train can reach, from an end of the track, the position after a transition, shape (n - 1, m).
         self._enters = to_end[1:] <= self._reach[:, None]
         ends = np.array([[(t, e) not in network.passages for e in (0, 1)] for t in range(len(network.tracks))])
         at_end = ends[self._track] & (np.stack([self._place, self._rest], axis=-1) <= _ROUNDED_M)
@@ -123,7 +123,7 @@ class Transitions:
 
     @property
     def changes(self) -> Masks:
-        """Whether each transition is to another track, or to or from unmapped track, shape (n - 1, m + 1, m + 1)."""
+        """Whether each transition changes the track (unmapped is one track), shape (n - 1, m + 1, m + 1)."""
         state = np.column_stack([np.where(self._track < 0, -2, self._track), np.full(len(self._track), -1)])
         return np.asarray(state[:-1, :, None] != state[1:, None, :])
 
@@ -185,7 +185,7 @@ def _shifted(moved_m: float, turned: bool) -> Floats:
     """Return relative transition probabilities between `SHIFTS_M`, from row to column, shape (S, S).
 
     The reference track of the columns is `moved_m` to the right of the reference track of the rows. The two reference
-    tracks have opposite directions if `turned`.
+    tracks have opposite directions if `turned` is True.
     """
     place = (SHIFTS_M - moved_m) * (-1.0 if turned else 1.0)
     apart = np.abs(place[:, None] - SHIFTS_M)

@@ -48,7 +48,7 @@ _NO_TRACK: Final = {"track": -1, "chainage_m": np.nan, "offset_m": np.inf}
 #: Values in `Matched` for a position that was not matched.
 _NO_MATCH: Final = {"track": -1, **dict.fromkeys(("chainage_m", "offset_m", "probability", "probabilities"), np.nan)}
 _NORMAL_MEDIAN: Final = 0.6745  #: Median of the absolute value of a standard normal variable.
-_ROUNDED_M: Final = 0.1  #: Unmapped tracks may be closer to mapped tracks than `CLEARANCE_M` by this [m].
+_ROUNDED_M: Final = 0.1  #: The distance of unmapped from mapped tracks may be smaller than `CLEARANCE_M` by this [m].
 _STEP_S: Final = 0.4  #: Time step assumed where times are missing or decrease [s].
 _MOST_TRACKS: Final = 16  #: Largest number of candidate tracks for a position.
 #: Heights are used if the candidate tracks of a position differ in height by more than this value [m].
@@ -175,9 +175,9 @@ def match(
     log : PlanLog
         Positions in the order of travel, in the frame of the network.
     sigma_m : float, optional [m]
-        Standard deviation of a position's distance from the track; by default stated in the log or estimated.
+        Standard deviation of a position's distance from the track; by default as stated in the log, or estimated.
     within_m : float, optional [m]
-        Largest distance of a position from its track; by default five standard deviations, within 30 to 100 m.
+        Largest distance of a position from its track; by default five standard deviations, limited to 30 m to 100 m.
     correlation_s : float [s]
         Correlation time of the position errors.
 
@@ -233,8 +233,8 @@ def _sigma(network: Network, log: PlanLog, given: Indices, sigma_m: float | None
 def _estimate_sigma(network: Network, log: PlanLog, rows: Indices) -> tuple[float, str]:
     """Estimate the standard deviation of distances from a track [m], and describe in a clause how it was obtained.
 
-    Only positions near a single track are used, because near parallel tracks an error cannot be distinguished from a
-    position on the other track.
+    Only positions near a single track are used. If two tracks are parallel, an error cannot be distinguished from a
+    position on the second track.
     """
     latitude, longitude = log.latitude_deg[rows], log.longitude_deg[rows]
     near = network.near(latitude, longitude, within_m=_FARTHEST_M, most=2)

@@ -157,7 +157,7 @@ def is_route(segments: Sequence[Segment]) -> bool:
 
 
 def _places_of_ends(whole: Network, tolerance_m: float) -> dict[int, list[float]]:
-    """Return the chainages [m] at which other tracks end within `tolerance_m`, in ascending order, by track index."""
+    """For each track index, return the ascending chainages [m] at which other tracks end within `tolerance_m`."""
     tracks = whole.tracks
     latitude = np.array([[t.latitude_deg[0], t.latitude_deg[-1]] for t in tracks]).ravel()
     longitude = np.array([[t.longitude_deg[0], t.longitude_deg[-1]] for t in tracks]).ravel()
@@ -215,7 +215,7 @@ _KINK_DEG: Final = 15.0
 _LEAST_SPACING_M: Final = 2.5
 #: The spacing of tracks is not checked within this distance of their ends, because tracks join in switches [m].
 _SWITCH_M: Final = 80.0
-_LEAST_WAY_M: Final = 10.0  #: Tracks too near each other on a shorter length are not reported [m].
+_LEAST_WAY_M: Final = 10.0  #: Tracks that are too near each other over less than this length are not reported [m].
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -70,9 +70,9 @@ def fill_gaps(network: Network, matched: Matched, log: PlanLog, *, rows_to_fill:
 def _fill_before(
     network: Network, matched: Matched, log: PlanLog, travelled_m: Floats, rows: Indices, filled: Filled
 ) -> None:
-    """Fill the rows before the first or after the last known position in `filled`.
+    """In `filled`, fill the rows before the first or after the last known position.
 
-    `rows` begin at the known position. They are filled up to the first row without a position.
+    The first of the `rows` has the known position. `rows` are filled up to the first row without a position.
     """
     rows = rows[: np.argmin([*np.isfinite(travelled_m[rows]), False])]
     if len(rows) < 2:
@@ -157,7 +157,7 @@ def _fill_legs(
 
 
 def find_route(network: Network, matched: Matched, path: str = "the log") -> tuple[list[int], list[int]]:
-    """Return the tracks passed by a run in order of travel, and other tracks with positions, as indices.
+    """Return the indices of the tracks that a run passed, in order of travel, and of other tracks with positions.
 
     Each track is in the route once. The other tracks cannot be joined to the route. Raise MismatchError if no position
     lies on a track; the message states the log and the location of the positions.

@@ -28,8 +28,8 @@ class Passes(NamedTuple):
 def find_segments_near(ecef_m: Floats, trajectory: Trajectory, reach_m: Floats | float) -> Passes:
     """Find the segments within `reach_m` of each position, shape (n, 3).
 
-    A segment is found if its middle is within `reach_m` plus half the longest segment. Some segments are therefore
-    farther away than `reach_m`.
+    A segment is found if its middle is within `reach_m` plus half the length of the longest segment. Some segments are
+    therefore farther away than `reach_m`.
     """
     length, tangent = trajectory.length_m, trajectory.tangent
     middle = 0.5 * (trajectory.ecef_m[1:] + trajectory.ecef_m[:-1])

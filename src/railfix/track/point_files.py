@@ -138,7 +138,7 @@ class _GeojsonLine:
         raise self.error(f"{key} is {value!r}; a text was expected")
 
     def array(self, key: str, blank: float) -> Floats | None:
-        """Return a property with one value per point, shape (n,), or None if it is missing; null becomes `blank`."""
+        """Return a property, shape (n,), with `blank` for null values of points; None if the property is missing."""
         value = self.properties.get(key)
         if value is None:
             return None
@@ -154,7 +154,7 @@ class _GeojsonLine:
 
 
 def _crs_member(path: str, document: dict[str, Any]) -> str | None:
-    """Return the CRS of the ``crs`` member (GeoJSON 2008, section 3), which many programs write; None if missing."""
+    """Return the CRS of the ``crs`` member (GeoJSON 2008, section 3), which many programs write; None without it."""
     member = document.get("crs")
     if member is None:
         return None
@@ -216,7 +216,7 @@ def _without_geometry(document: dict[str, Any]) -> list[int]:
 
 
 def _of_overpass(path: str, document: dict[str, Any], reading: MapReading) -> list[Segment]:
-    """Return the ways of an Overpass JSON document as segments; a note states which ways are left out as no tracks."""
+    """Return the ways of an Overpass JSON document as segments; a note states which ways are left out as non-tracks."""
     of_file = replace(reading, crs=choose_crs(path, reading.crs, "EPSG:4326"))
     ways = [(way, no_track(way.row, of_openstreetmap=True)) for way in read_overpass(path, document["elements"])]
     segments = [

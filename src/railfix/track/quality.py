@@ -21,7 +21,7 @@ from railfix.track.geometry import Geometry, compute_geometry, mean_gradients
 from railfix.track.track import BACKWARDS, HEIGHTS_M, Track, kilometrage_breaks
 
 Severity = Literal["error", "warning"]
-_COARSE_DEG: Final = 1e-5  #: Coordinates in steps of this count as rounded [deg]; errors are up to 0.6 m.
+_COARSE_DEG: Final = 1e-5  #: Multiples of this count as rounded coordinates [deg]; rounding errors are up to 0.6 m.
 _LEAST_CANT_M: Final = 5e-4  #: If the largest cant of a map is below this [m], the unit of the cant must be wrong.
 _NEAR_DUPLICATE_M: Final = 0.10  #: Spacing below which two points are reported as one point measured twice [m].
 _CURVED_1PM: Final = 1 / 3000  #: Curvature below which the track counts as straight [1/m].

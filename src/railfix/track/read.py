@@ -128,8 +128,8 @@ def check_heights(
 ) -> None:
     """Check that the heights come from either the segments or `heights`.
 
-    Raise InputFileError if there are no heights. Raise SettingsError if both have heights, or if options for a raster
-    are missing.
+    Raise InputFileError if there are no heights. Raise SettingsError if `heights` is given although a segment has
+    heights, or if options for a raster are missing.
     """
     flat = [s for s in segments if s.height_datum == NO_HEIGHTS]
     if flat and heights is None:

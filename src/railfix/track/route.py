@@ -173,8 +173,8 @@ def _turn(ends: Floats, max_gap_m: float) -> list[bool]:
 
 
 def first_gap(segments: Sequence[Segment], *, max_gap_m: float = MAX_GAP_M) -> tuple[int, float] | None:
-    """Return the index of the first segment that does not meet the previous segment, and the gap [m], or None if all
-    segments meet.
+    """Return the index of the first segment that does not meet the previous segment, and the gap [m]; if all segments
+    meet, None instead of both.
 
     Segments meet if the gap between their ends is at most `max_gap_m`.
     """
@@ -250,10 +250,10 @@ def _unique(values: Iterable[str]) -> tuple[str, ...]:
 
 
 def sigma_of_files(pieces: Sequence[Segment], key: str, default: float) -> float:
-    """Return the largest standard deviation of the pieces [m]; it includes the piece's datum transformation.
+    """Return the largest standard deviation of the pieces [m], each with the error of its datum transformation.
 
-    The standard deviation of a piece is the metadata entry `key` of its file, or `default` if the file has no such
-    entry. Raise InputFileError if an entry is not a positive number.
+    Without this error, the standard deviation of a piece is the metadata entry `key` of its file, or `default` if the
+    file has no such entry. Raise InputFileError if an entry is not a positive number.
     """
     sigmas: list[float] = []
     for piece in pieces:

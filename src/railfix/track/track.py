@@ -26,7 +26,7 @@ UNNAMED = "not named (WGS 84 assumed)"  #: `Provenance.crs` of a map that names 
 #: than this value plus a twentieth of the length [m].
 KILOMETRAGE_BREAK_M = 1.0
 HEIGHTS_M = (-1000.0, 9000.0)  #: Range of accepted ellipsoidal heights, including tunnels below the sea [m].
-ANOTHER_PLACE_M = 100_000.0  #: A log and a map farther apart than this are taken as of different regions [m].
+ANOTHER_PLACE_M = 100_000.0  #: A log and a map farther apart than this count as from different regions [m].
 
 
 @dataclass(frozen=True, kw_only=True)

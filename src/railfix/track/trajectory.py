@@ -17,7 +17,7 @@ from railfix.core.notebook import NotebookTable, plural
 from railfix.track.track import SIGMA_HEIGHT_M, SIGMA_PLAN_M, Track, interpolate_kilometrage
 
 #: Number of candidate samples per position in the first round of the search. Each further round uses four times as many
-#: candidates, for positions whose nearest point is not yet certain.
+#: candidates as the previous round, for positions whose nearest point is not yet certain.
 _FIRST_CANDIDATES = 6
 _CHUNK = 2_000_000  #: Largest number of pairs of a position and a candidate in one array.
 
@@ -70,7 +70,7 @@ class NearestOnPolyline:
         return index, along, offset
 
     def _among(self, points: Floats, candidates: int) -> tuple[Indices, Floats, Floats, Masks]:
-        """Find the nearest segment among those of the nearest samples, and whether no other segment can be nearer."""
+        """Find the nearest of the segments with the nearest samples, and whether no other segment can be nearer."""
         nearest = self._tree.query(points, k=np.arange(1, candidates + 1))
         distance, sample = np.asarray(nearest[0], dtype=np.float64), np.asarray(nearest[1], dtype=np.intp)
         chosen, share, best = nearest_segments(points, self._segment[sample], self._start, self._step)
@@ -81,7 +81,7 @@ class NearestOnPolyline:
 def nearest_segments(
     points_m: Floats, segment: Indices, start_m: Floats, step_m: Floats
 ) -> tuple[Indices, Floats, Floats]:
-    """Find each point's nearest segment among C candidates (n, C), the fraction along it, and the distance to it."""
+    """Return each point's nearest segment among C candidates (n, C), the fraction along it, and its distance."""
     share, offset = project_on_segments(points_m[:, None], start_m[segment], step_m[segment])
     best = offset.min(axis=1)
     # of equally near segments, return the first on the line, whatever the order of the candidates
@@ -90,21 +90,21 @@ def nearest_segments(
     return segment[row, column], share[row, column], best
 
 
-#: A line is closed if its end is within this distance of another part of it [m]; parallel tracks are farther apart.
+#: A line is closed if its end is within this distance of another part [m]; parallel tracks are farther apart.
 _CLOSED_M: Final = 3.0
 _SAME_WAY: Final = 0.9  #: Cosine of the largest angle between two parts that count as parallel.
 _END_M: Final = 100.0  #: Parts of the line within this length of its end are not searched [m].
 
 
 def joins_m(arc_m: Floats, ecef_m: Floats) -> tuple[float, float]:
-    """Return the arc lengths at which a closed line passes its start again, and its end again [m]; NaN if open."""
+    """Return the arc lengths at which a closed line passes its start and its end again [m]; NaN at an open end."""
     segment = np.diff(ecef_m, axis=0)
     segment /= np.linalg.norm(segment, axis=1, keepdims=True)
     return _beside(arc_m, ecef_m, segment, 0), _beside(arc_m, ecef_m, segment, -1)
 
 
 def _beside(arc_m: Floats, ecef_m: Floats, segment: Floats, end: int) -> float:
-    """Return the arc length of the nearest part of the line that is parallel to an end [m]; NaN if none is."""
+    """Return the arc length of the nearest part of the line that is parallel to an end [m]; NaN if no part is."""
     from_end = ecef_m[end] - ecef_m[:-1]
     length = np.diff(arc_m)
     along = np.clip((from_end * segment).sum(axis=1), 0.0, length)
@@ -139,7 +139,7 @@ class Trajectory(FrozenArrays, NotebookTable):
     #: relates the positions of two antennas on one vehicle. It is None without a vehicle.
     body_chainage_m: Floats | None = None
     facing: Literal["rising", "falling"] = "rising"  #: Whether the front points to rising or falling chainage.
-    #: Distance of the antenna ahead of the midpoint between the bogies, toward the vehicle's front.
+    #: Distance from the midpoint between the bogies to the antenna, positive toward the vehicle's front.
     antenna_ahead_m: float = 0.0
     #: Distance from the midpoint between the bogies to the vehicle's front end; None if unknown.
     front_end_m: float | None = None
@@ -261,7 +261,7 @@ class Trajectory(FrozenArrays, NotebookTable):
         return NearestOnPolyline(self.ecef_m)
 
     def segment_at(self, arc_m: ArrayLike) -> tuple[Indices, Floats]:
-        """Return the segment at each arc length, of any shape, and the distance along the segment [m].
+        """Return the segments at arc lengths of any shape, and the distances along these segments [m].
 
         A point shared by two segments belongs to the later one. Before the start, the first segment and a negative
         distance are returned; beyond the end, the last segment; for NaN, the last segment and NaN.

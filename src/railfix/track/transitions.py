@@ -118,7 +118,7 @@ def cubic_of_length(
     """Compute a cubic parabola of a given curve length.
 
     `first` and `last` are the curvatures at the ends, positive to the left [1/m]; one of them is 0. The variant is
-    ``"length"`` (IFC), ``"tangent"`` (length projected on it) or ``"corrected"`` (Japanese railways).
+    ``"length"`` (IFC), ``"tangent"`` (length on the tangent) or ``"corrected"`` (Japanese railways).
     """
     into = first == 0.0
     curvature = last if into else -first

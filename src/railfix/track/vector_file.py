@@ -124,7 +124,7 @@ def get_metadata(row: Mapping[str, Any]) -> dict[str, str]:
 
 
 def find_level(tags: Mapping[str, Any]) -> int:
-    """Return the level of a way from the tags layer, bridge and tunnel; the ground has level 0."""
+    """Return the level of a way from the tags `layer`, `bridge` and `tunnel`; the ground has level 0."""
     try:
         return int(str(tags.get("layer") or ""))
     except ValueError:
@@ -175,7 +175,7 @@ def read_osm_xml(path: FilePath) -> list[Way]:
 
 
 def _is_crossing(tags: Mapping[Any, Any]) -> bool:
-    """Return whether a node is a crossing of tracks without a connection (no slip switch)."""
+    """Return whether a node is a crossing of unconnected tracks (no slip switch)."""
     return tags.get("railway") == "railway_crossing" and not tags.get("railway:switch")
 
 

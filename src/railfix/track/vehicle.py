@@ -50,7 +50,7 @@ class Vehicle(Settings):
     model_config = ConfigDict(strict=True)
     name: str = "vehicle"
     bogie_distance_m: float = Field(gt=0.5, le=30.0)  #: Straight distance between the two bogie centres.
-    #: Track gauge. Cant is measured over the distance between the contact points, the gauge plus `RAIL_HEAD_M`.
+    #: Track gauge. Cant is measured over the distance between the contact points, `gauge_m` + `RAIL_HEAD_M`.
     gauge_m: float = Field(default=1.067, ge=0.5, le=2.0)
     facing: Literal["rising", "falling"] = "rising"  #: Whether the front points to rising or falling chainage.
     #: Length of the vehicle over buffers or couplers; None if unknown.
@@ -246,7 +246,7 @@ def _place(body: Body, vehicle: Vehicle, offset: AntennaOffset) -> Floats:
 
 
 def _abeam(line: _VehicleLine, body: Body, antenna: Floats, along_m: float) -> Floats:
-    """Return the chainage [m] at which the centreline crosses the antenna's plane perpendicular to the body."""
+    """Return the chainage [m] where the centreline crosses the antenna's plane normal to `body.forward`."""
     chainage = (body.lower_m + body.upper_m) / 2.0 + along_m
     for _ in range(_MAX_ITERATIONS):
         ahead = np.einsum("vi,vi->v", line.at(chainage) - antenna, body.forward)

@@ -1,7 +1,7 @@
 """Along-track filter of codes, Dopplers, carrier phases and sensor measurements, with a hypothesis per possible branch.
 
 `track` requires epochs and the state after all previous epochs. It returns the positions of these epochs along the
-trajectory, and the state after the last of them. All quantities are numpy arrays.
+trajectory, and the state after the last epoch. All quantities are numpy arrays.
 """
 
 import lazy_loader

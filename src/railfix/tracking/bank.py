@@ -43,8 +43,8 @@ class SourceKind(IntEnum):
     ALL_IN_VIEW = 7
 
 
-#: Kinds of the sources other than satellites, constellations and sensors: all Dopplers, all phases, all codes of the
-#: satellites ahead or behind, and the map. The sub-filter "all in view" excludes no source.
+#: Kinds of the sources other than satellites, constellations and sensors: all Dopplers, all phases, the codes of all
+#: satellites ahead, the codes of all satellites behind, and the map. The sub-filter "all in view" excludes no source.
 OTHERS: Final = {
     "doppler": SourceKind.MOTION,
     "phase": SourceKind.MOTION,

@@ -121,7 +121,7 @@ def compute_singer_step(dt: float, sigma_mps2: float, tau_s: float) -> tuple[Flo
 
 
 def _write_velocities(epoch: Records, channel: Records, near_ecef_m: Floats) -> None:
-    """Compute velocities without the line, and write them to the records `epoch`."""
+    """Compute the antenna velocities without use of the line, and write them to the records `epoch`."""
     from railfix.kernels.tracking.velocity import write_velocities
 
     latitude, longitude, _ = geodetic_from_ecef(np.where(np.isfinite(near_ecef_m), near_ecef_m, 1e6))

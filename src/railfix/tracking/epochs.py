@@ -28,7 +28,7 @@ class Kind(IntEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class GnssEpochs:
-    """Corrected GNSS measurements of one antenna; NaN where absent or not to be used."""
+    """Corrected GNSS measurements of one antenna; NaN where a measurement is absent or must not be used."""
 
     time: Datetimes  #: Time of each epoch, shape (T,).
     satellite: Strings  #: Satellite of each channel, shape (K,).

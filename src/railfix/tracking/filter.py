@@ -80,7 +80,7 @@ class Recursion:
         """Process epochs from `first` on, and update the state.
 
         Only the epoch `first` is processed if `found` is the result of a position search at this epoch, or if a `trace`
-        is required. Return the index of the next epoch, and the reasons for a position search at it (0: no search).
+        is required. Return the index of the next epoch, and the reasons for a search at this epoch, 0 if none.
         """
         count, width = state.mean.shape
         last = len(self.chunk.time) if trace is None and found is None else first + 1
@@ -144,7 +144,7 @@ def track(
     limits : TrackingLimits, optional
     sensors : SensorEpochs, optional
     levels : bool
-        If True, sub-filters compute a protection level at every epoch. (`railfix.tracking.levels` has a lower rate.)
+        If True, sub-filters compute a protection level at every epoch. (`railfix.tracking.levels` uses fewer epochs.)
     trace : list of Step, optional
         List to which the record of each epoch is appended for the smoother (`railfix.tracking.smoother`).
 

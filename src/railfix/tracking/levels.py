@@ -46,7 +46,7 @@ class AccumulatedIncrement:
     start: np.datetime64 = field(default_factory=lambda: np.datetime64("NaT", "ns"))
     number: int = -1  #: Number of periods from `start` to the last selected epoch; -1 before the first selected epoch.
     epochs: int = 0  #: Number of epochs since the last selected epoch.
-    #: Channels whose carrier phase has continued since the last selected epoch; None if that was the last epoch.
+    #: Channels whose carrier phase has continued since the last selected epoch; None if the last epoch was selected.
     unbroken: frozenset[str] | None = None
     #: Sums of wheel distances [m], radar distances [m] and forces [m/s2]; sums of their variances; each of shape (3,).
     total: Floats = field(default_factory=lambda: np.zeros(3))
@@ -179,8 +179,8 @@ def carried_levels(
     """Return the main filter's results, with protection levels propagated from the epochs of the second filter.
 
     `tracked` are the main filter's results. The second filter, which has sub-filters, ran at the epochs `taken`, with
-    the results `with_bank` (None if `taken` is empty). `state` is the second filter's state before the chunk; its state
-    after the chunk is returned, too.
+    the results `with_bank` (None if `taken` is empty). `state` is the second filter's state before the chunk; the
+    second filter's state after the chunk is returned, too.
     """
     number = taken.searchsorted(np.arange(len(tracked)), side="right")
     times, values = np.array([state.time]), state.values[None]

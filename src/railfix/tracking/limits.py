@@ -32,7 +32,7 @@ class Tails(NamedTuple):
 
 
 class TrackingLimits(Settings):
-    """Process and measurement noise of the filter, and criteria for keeping branches and searching for them."""
+    """Process and measurement noise of the filter, and criteria for keeping and finding branches."""
 
     #: Standard deviation and correlation time of the acceleration along the track (R. A. Singer, 1970). Trains brake
     #: and accelerate at up to 1.3 m/s2 for some seconds; road vehicles reach higher values for shorter times.
@@ -51,8 +51,8 @@ class TrackingLimits(Settings):
     late_degrees_of_freedom: float = Field(default=1.0, gt=0)
     #: Standard deviation of the white code error, averaged over one second, as a fraction of the code sigma.
     code_white_share: float = Field(default=1.0, gt=0)
-    #: Interval at which codes are used while phases or Dopplers propagate the position; 0 for every epoch. Code errors
-    #: last about a minute; codes at intermediate epochs therefore add no information.
+    #: Interval at which codes are used while phases or Dopplers propagate the position; 0 uses the codes of every
+    #: epoch. Code errors last about a minute; codes at intermediate epochs therefore add no information.
     code_period_s: float = Field(default=1.0, ge=0)
     #: Standard deviation of the position displacement along the line by orbit and ionospheric errors: errors of about 1
     #: m per satellite, and a dilution of precision of one. The errors last for hours; averaging does not reduce them.
@@ -82,7 +82,7 @@ class TrackingLimits(Settings):
     #: Probability that a satellite is faulty in one independent sample, because city multipath exceeds the assumed
     #: error. Two given satellites are faulty with the square of this probability. The value is an assumption.
     level_fault_prior: float = Field(default=1e-3, ge=0, lt=1)
-    #: Probability of a fault common to a constellation. The ARAIM milestone 3 report assumes 1e-4 for Galileo.
+    #: Probability that a whole constellation is faulty. The ARAIM milestone 3 report assumes 1e-4 for Galileo.
     level_constellation_prior: float = Field(default=1e-4, ge=0, lt=1)
     #: Probability that an on-board sensor is faulty in one independent sample. The value is an assumption.
     level_sensor_prior: float = Field(default=1e-3, ge=0, lt=1)

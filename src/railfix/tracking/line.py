@@ -14,8 +14,8 @@ from railfix.ranges.atmosphere import geomagnetic_latitude
 from railfix.track.trajectory import Trajectory
 
 #: Standard deviation of the position displacement along the line by a horizontal gradient of the ionosphere [m], for
-#: geomagnetic latitudes up to 20 deg, up to 55 deg, and beyond. It is 2/9 of the vertical-delay sigmas without SBAS (9
-#: m, 4.5 m, 6 m) in DO-229D J.2.3. `GnssEpochs.tilt_scale` multiplies this sigma and `slow_code_m` at each epoch.
+#: geomagnetic latitudes up to 20, 20 to 55, and above 55 deg: 2/9 of the vertical-delay sigmas without SBAS (9 m, 4.5
+#: m, 6 m) in DO-229D J.2.3. `GnssEpochs.tilt_scale` multiplies this sigma and `slow_code_m` at each epoch.
 TILT_M: Final = (2.0, 1.0, 1.33)
 _TILT_LATITUDES_DEG: Final = (20.0, 55.0)
 
@@ -66,7 +66,7 @@ class Line:
         return bool(np.isfinite(self.joins_m).any())
 
     def round_m(self, arc_m: Floats) -> Floats:
-        """Return the shift [m] that moves positions beyond an end of a closed line back onto the line, or 0."""
+        """Return the shift [m] that moves positions beyond an end of a closed line back onto the line; 0 if on it."""
         back = np.zeros(np.shape(arc_m))
         first, last = self.arc_m[0], self.arc_m[-1]
         for excess, turn in ((arc_m - last, last - self.joins_m[1]), (first - arc_m, first - self.joins_m[0])):

@@ -47,12 +47,12 @@ class Tracked(NotebookTable):
     #: Factor of the assumed error of map lengths, shape (T,); 1 if codes do not contradict the map lengths.
     map_scale: Floats
     level_m: Floats  #: Protection level of the error along the line, shape (T,); NaN where levels are off.
-    #: Protection level of the straight distance, shape (T,), including other branches and lateral errors of the map.
+    #: Protection level of the straight distance to the train, shape (T,); covers other branches and lateral map errors.
     ground_level_m: Floats
     level_noise_m: Floats  #: Protection level for noise alone, without faults or other branches, shape (T,).
     #: Bound of the speed error, used to propagate protection levels to later epochs, shape (T,).
     level_speed_mps: Floats
-    #: Largest difference between the positions of filter and sub-filter, shape (T,); NaN where levels are off.
+    #: Largest difference between the positions of the filter and a sub-filter, shape (T,); NaN where levels are off.
     separation_m: Floats
     #: Probability of faults that the level does not cover, such as a fault of the only constellation, shape (T,).
     unchecked_prior: Floats

@@ -20,7 +20,7 @@ from railfix.tracking.state import ANY_SPEED, HYPOTHESIS, TrackState
 #: Largest spacing of the points at which the line is searched [m]. A Gaussian of `START_SIGMA_M` covers the positions
 #: between two points, and the code variance includes the distance to the nearest point.
 _SPACING_M: Final = 15.0
-#: Minimum number of redundant codes for a search. A wrong position can fit one redundant code too.
+#: Minimum number of redundant codes for a search. If only one code is redundant, a wrong position can fit all codes.
 REDUNDANT: Final = 2
 #: A position becomes a hypothesis only if its log likelihood is within this difference of the maximum.
 _WORSE: Final = 25.0

@@ -15,7 +15,7 @@ from railfix.track.survey.passes import Ties
 from railfix.track.survey.runs import CLIMB_MPS2, RunSignals, SurveyLimits, SurveyRun
 
 #: Standard deviation of the pseudo-observation that shifts of the line have the second difference 0 [m]. For shifts
-#: across the line, `_CORNER_M` times the squared turn [rad^2] is added, because they bend the line at a corner.
+#: across the line, `_CORNER_M` times the squared turn [rad^2] is added, because such shifts bend the line at a corner.
 _BEND_M: Final = 0.05
 _CORNER_M: Final = 5.0
 

@@ -53,7 +53,7 @@ class Adjusted:
 
     #: Adjusted positions of each run, corrected for the run's offset, shape (n, 3).
     ecef_m: tuple[Floats, ...]
-    #: Shifts of the line's points from the reference line, across and upward, shape (J, 2); (0, 2) without `line`.
+    #: Shifts of the line's points from the reference line, across and upward, shape (J, 2); (0, 2) without a line.
     line_m: Floats
     line_sigma_m: Floats  #: Standard deviations of `line_m`, shape (J, 2); (0, 2) if not requested.
     #: Mean weight of the positions or codes in each row of each run, shape (n,). It is about 1 if the row has no
@@ -75,8 +75,8 @@ def adjust(
     """Adjust the positions of all runs and, if `line` and `ties` are given, the points of the line.
 
     `near_ecef_m` are approximate positions of each run, shape (n, 3). `repeats` states, for each row, how often the run
-    passes the position of the row; the row's weight is divided by it. With ``sigmas="line"``, `line_sigma_m` is
-    computed.
+    passes the position of the row; the row's weight is divided by this number. With ``sigmas="line"``, `line_sigma_m`
+    is computed.
     """
     limits = limits or SurveyLimits()
     origin = np.mean(near_ecef_m[0], axis=0)
@@ -211,10 +211,10 @@ def _of_rows(weight: Floats, run: SurveyRun) -> Floats:
 
 
 _ROUNDS: Final = 3  #: Number of adjustments that include the line. The passes are searched before each adjustment.
-#: Passes in opposite directions count as on separate tracks if they are farther apart than this number of standard
+#: Passes in opposite directions are assigned to separate tracks if they are farther apart than this number of standard
 #: deviations of a run's offset. The value is three standard deviations of the difference of two offsets.
 _OTHER_TRACK: Final = 3.0 * 2.0**0.5
-_TURN_M: Final = 40.0  #: Reversals are found from the directions over half of this, before and after a point [m].
+_TURN_M: Final = 40.0  #: Reversals are found from the directions over half of this length before and after a point [m].
 _END_POINTS: Final = 8  #: Number of points from which the direction at an end of the line is computed.
 _OF_THE_MAP: Final = 95.0  #: The map's accuracy is this percentile of the standard deviations along the line.
 

@@ -14,7 +14,7 @@ from railfix.core.arrays import Floats, Indices, Integers
 from railfix.track.survey.runs import SurveyLimits
 
 _SAME_WAY: Final = 0.7  #: Cosine of the largest angle between two passes of one line.
-#: A part of a leg can repeat an earlier part only if they are this many line widths (`same_line_m`) apart on the leg.
+#: A part of a leg can repeat an earlier part only if both are this many line widths (`same_line_m`) apart on the leg.
 _APART_WIDTHS: Final = 3.0
 _MOSTLY: Final = 0.8  #: Minimum fraction of points that must show a repetition, or another track.
 _SEAM_M: Final = 200.0  #: The offset between two joined passes is distributed over this distance [m].
@@ -23,7 +23,7 @@ _GAP_S: Final = 10.0  #: A longer time without rows is a gap [s].
 BRIDGED_M: Final = 500.0
 #: Cosine of the largest change of direction over a gap within a leg. At a larger change, the leg ends.
 _GOES_ON: Final = 0.9
-_NEIGHBOURS: Final = 24  #: Number of nearest points of the line that are compared with a point.
+_NEIGHBOURS: Final = 24  #: Number of the line's nearest points that are compared with a point of a leg.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,7 +179,7 @@ def find_course(legs: Sequence[Leg], limits: SurveyLimits) -> Course:
 
 
 def _until_repeated(points: Floats, spacing_m: float, width_m: float) -> Course:
-    """Return a polyline up to where it begins to repeat an earlier part of itself, for at least `_APART_WIDTHS`."""
+    """Return a polyline up to where it begins to repeat an earlier part of itself over `_APART_WIDTHS` line widths."""
     least = int(_APART_WIDTHS * width_m / spacing_m)
     way = directions(points)
     tree = cKDTree(points[:, :2])
@@ -365,7 +365,7 @@ class Ties:
 
 
 def find_ties(course: Course, legs: Sequence[Leg], passes: Sequence[Pass]) -> Ties:
-    """For each pass, interpolate the run's positions abreast of the points of the line on the pass."""
+    """For each pass, interpolate the run's positions abreast of those points of the line that the pass covers."""
     parts: list[tuple[Indices, Indices, Floats, Indices, Indices]] = []
     for number, each in enumerate(passes):
         place, arc = each.sign * each.place, each.arc_m

@@ -110,7 +110,7 @@ def run_of_log(log: PositionLog, limits: SurveyLimits) -> SurveyRun:
     """Convert a position log to a run of a survey.
 
     The positions are sorted and thinned to `limits.interval_s`. Sigmas below a third of `SIGMA_OF_QUALITY` are
-    increased to it. Raise ValueError if fewer than three positions remain.
+    increased to this third. Raise ValueError if fewer than three positions remain.
     """
     rows = np.flatnonzero(np.isfinite(log.ecef_m).all(axis=1) & ~np.isnat(log.time))
     rows = rows[np.argsort(log.time[rows], kind="stable")]
