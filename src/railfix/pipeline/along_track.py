@@ -53,7 +53,7 @@ _END_SIGMAS: Final = 4.0
 _END_M: Final = 30.0
 #: A two-way range is used if it differs from the predicted range by at most this number of standard deviations.
 _GATE_SIGMAS: Final = 3.0
-#: Two-way ranges too long by up to this are also used [m]. Echoes over 0.3 m longer are separable (P2, table 3).
+#: Two-way ranges too long by at most this are also used [m]. Echoes delayed by over 0.3 m are separable (P2, table 3).
 _LATE_M: Final = 0.6
 #: Vertical error of the ionospheric model that the filter's constants `slow_code_m` and `TILT_M` assume [m].
 _QUIET_IONOSPHERE_M: Final = 1.0
@@ -104,7 +104,7 @@ def along_track(
             sure = np.where(is_bounded(tracked.status), tracked.sigma_m, np.nan)
             of_filter, filter_wheel = _against_wheel(replays, tracked.arc_m, sure, after.filter_wheel, config)
             after, tracked = replace(after, filter_wheel=filter_wheel), _bound_by_wheel(tracked, of_filter.bound_m)
-        # spoofing replaces a doubt of unknown cause; a time-tag error replaces both
+        # the spoofing status replaces a doubtful status, unless a time-tag error is suspected
         unnamed = (tracked.status == TrackStatus.DOUBTFUL) & (single.suspicion != Suspicion.TIME_TAGS)
         parted = wheel.parted & (is_bounded(tracked.status) | unnamed)
         tracked = mark_doubtful(tracked, parted, TrackStatus.SPOOFING_SUSPECTED)
@@ -274,7 +274,7 @@ def _gate(
 
 
 def _gated_ranges(ranges: RangeEpochs, time: Datetimes, line: Line, state: FilterState, config: Config) -> RangeEpochs:
-    """Return two-way ranges; a range is NaN if it contradicts the filter's position, or if there is none (P2 3.3).
+    """Return two-way ranges, NaN where they contradict the filter's position or the filter has no position (P2 3.3).
 
     The gate rejects echoes and ranges to wrongly surveyed units. The position is predicted from the start of the block
     with constant speed; to allow for acceleration, the gate widens with the square of the elapsed time.

@@ -32,8 +32,8 @@ _LEAST_DISTANCE_M: Final = 0.5
 class AntennaOrder:
     """Mean distance by which the front antenna is ahead of the rear antenna, from positions on the same track.
 
-    `distance_m` is the distance of the front antenna ahead of the rear antenna according to the vehicle file [m].
-    Epochs of the two antennas are paired if their time tags differ by at most `tolerance_s`.
+    `distance_m` is the distance by which the front antenna is ahead according to the vehicle file [m]. Epochs of the
+    two antennas are paired if their time tags differ by at most `tolerance_s`.
     """
 
     def __init__(self, front: Trajectory, rear: Trajectory, *, tolerance_s: float) -> None:
@@ -84,7 +84,7 @@ class AntennaOrder:
         return len(self._stretches) > seen
 
     def measure(self) -> tuple[float, float]:
-        """Return the mean distance of the front antenna ahead of the rear antenna, and the sigma of the mean [m].
+        """Return the mean distance by which the front antenna is ahead of the rear antenna, and the mean's sigma [m].
 
         The mean distance on a stretch has the variance of a single pair, because position errors on a stretch do not
         average out. If the stretches scatter more than their variances explain, the sigma is larger. With fewer than

@@ -29,7 +29,7 @@ AGAIN_S: Final = 60.0
 class BaliseLimits(Settings):
     """Position of the balise reader on the vehicle, and accuracy of readings."""
 
-    #: Distance of the reader ahead of the vehicle's middle, or ahead of the antenna if there is no vehicle file.
+    #: Distance by which the reader is ahead of the vehicle's middle or, without vehicle file, ahead of the antenna.
     ahead_m: float = 0.0
     #: Minimum standard deviation, along the line, of the position from a balise reading: SUBSET-036 requires 1 m for
     #: safety-related use.
@@ -218,7 +218,7 @@ def _judge(
 
 
 def _odometer(place_m: float, time: np.datetime64, right: Sequence[tuple[np.datetime64, float]]) -> float:
-    """Return the accuracy [m] of an odometer reset at the last correct balise reading, NaN before the first."""
+    """Return the accuracy [m] of an odometer reset at the last correct balise reading; NaN before the first reading."""
     before = [place for at, place in right if seconds(time - at) > _APART_S]
     return ODOMETER_M + ODOMETER_SHARE * abs(place_m - before[-1]) if before else float("nan")
 
@@ -246,7 +246,7 @@ def _pass(
             continue
 
         def instant(first: float, last: float, k: int = int(row)) -> np.datetime64:
-            """Return when a value crosses zero between two epochs; the time of the earlier epoch if this is unknown."""
+            """Return the time of a zero crossing between two epochs; if unknown, the time of the earlier epoch."""
             span = float(seconds(time[k] - time[k - 1]))
             known = np.isfinite(first - last) and first != last and span <= _APART_S
             return np.datetime64(time[k - 1] + timedelta(span * first / (first - last) if known else 0.0))

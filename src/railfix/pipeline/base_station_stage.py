@@ -59,7 +59,7 @@ class BaseState:
         return () if self.errors is not None else (_NO_EPOCH,)
 
     def beside(self, received: Received) -> Received:
-        """Return the received data with the station's range errors, or with a note if there are none."""
+        """Return the received data with the station's range errors, or with a note if no range errors exist."""
         notes = tuple(note for note in received.notes if note != _NO_EPOCH)
         return replace(received, base=self.errors, notes=(*notes, *self.notes))
 
@@ -152,7 +152,7 @@ class BaseStation:
 
 
 def check_base(config: Config, base: BaseStation | None) -> None:
-    """Raise SettingsError if the settings require a base station and none is given, or do not allow the given one."""
+    """Raise SettingsError if a required base station is missing, or if the settings do not allow the base station."""
     if config.carrier == "fixed" and base is None:
         raise SettingsError("carrier = fixed requires a base station (--base); without one, set carrier = float")
     if config.sbas and base is not None:

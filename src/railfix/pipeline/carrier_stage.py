@@ -176,7 +176,7 @@ def _lasting(
 
 
 def _integer_channels(corrected: CorrectedRanges) -> IntegerChannels:
-    """Return the wavelength and ambiguity group (clock and signal) of each channel; GLONASS, never fixed, has -1."""
+    """Return wavelength and ambiguity group (clock and signal) of each channel; GLONASS, never fixed, has group -1."""
     names = zip(corrected.satellite.tolist(), corrected.signal.tolist(), strict=True)
     labels = ["" if name[0] == "R" else CLOCK_GROUP[name[0]] + signal for name, signal in names]
     _, group = np.unique(labels, return_inverse=True)

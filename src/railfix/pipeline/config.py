@@ -124,12 +124,12 @@ class Config(ScreenSettings):
     exclude: tuple[Annotated[str, Field(pattern=r"^[GJECR]([0-9]{2})?$")], ...] = ()
     #: Signals of each constellation in order of preference; the first observed signal is used.
     signals: dict[str, tuple[str, ...]] = Field(default_factory=lambda: dict(DEFAULT_SIGNALS))
-    #: Number of frequencies whose codes are used per satellite; always one with SBAS on L1 or a base station.
+    #: Number of frequencies whose codes are used per satellite; always one with a base station or with SBAS on L1.
     frequencies: Literal["one", "two"] = "one"
     two_frequencies: TwoFrequencyLimits = TwoFrequencyLimits()  #: Limits of the combination of a satellite's two codes.
     #: Names of the active screens. Satellite health and record validity are always checked.
     screens: tuple[str, ...] = SCREEN_NAMES
-    #: File with the mean C/N0 by elevation, written by ``railfix cn0-curve``. Without it, only the C/N0 floor applies.
+    #: File with mean C/N0 by elevation, written by ``railfix cn0-curve``. Without a file, only the C/N0 floor applies.
     cn0_curve: Path | None = None
     #: Treatment of positions with a failed check (`reasons.CHECK_FAILED`): "keep" sets the status of the check; "drop"
     #: also removes the coordinates, as in P1.
@@ -151,7 +151,7 @@ class Config(ScreenSettings):
     troposphere: Literal["saastamoinen", "off"] = "saastamoinen"  #: Model of the tropospheric delay.
     #: Navigation records older than this are not used, even if they are valid; by default, valid records are used.
     max_ephemeris_age_s: float | None = Field(default=None, gt=0)
-    #: Standard deviations of the map, instead of the values in the track file (P1: 0.30 m in plan, 0.60 m in height).
+    #: Standard deviations of map errors; they replace the track file's values (P1: 0.30 m in plan, 0.60 m in height).
     map_plan_sigma_m: float | None = Field(default=None, gt=0)
     map_height_sigma_m: float | None = Field(default=None, gt=0)
     noise_scale: NoiseScaleLimits = NoiseScaleLimits()  #: Estimation of the receiver's noise from the residuals.
@@ -184,7 +184,7 @@ class Config(ScreenSettings):
     #: Integrity risk per hour, its allocation, and the assumed fault probabilities.
     risk: RiskBudget = RiskBudget()
     #: Integrity support message (TOML, ``docs/protection-level.md``) for additional ARAIM levels, along the track and
-    #: in 3-D. It cannot be combined with SBAS.
+    #: in 3-D. The message cannot be combined with SBAS.
     integrity_support: Path | None = None
     araim: AraimBudget = AraimBudget()  #: Risk allocation of the ARAIM levels.
     #: A position is available only if its protection level is at most this. P4 uses a car length, 20 m.
@@ -197,7 +197,7 @@ class Config(ScreenSettings):
     #: Use of the carrier phase. "smoothed" smooths the codes. "float" and "fixed" estimate positions from the codes and
     #: phases up to the epoch, with float or integer ambiguities ("fixed" requires a base station). On recorded runs,
     #: smoothing helps phones most, and float ambiguities help most under open sky. In towns, where phase arcs last
-    #: seconds, neither setting removes large errors.
+    #: seconds, neither smoothing nor float ambiguities remove large errors.
     carrier: Literal["off", "smoothed", "float", "fixed"] = "off"
     #: Standard deviation of a carrier phase at the zenith, multipath included.
     phase_sigma_m: float = Field(default=0.01, gt=0)

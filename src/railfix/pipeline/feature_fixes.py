@@ -230,7 +230,7 @@ def _compare(
     last: tuple[float, float, float] | None,
     noise: tuple[float, float],
 ) -> LocatedFeature | None:
-    """Return the verdict on one feature; None if the train did not pass all of the feature without a break.
+    """Return the verdict on one feature; None unless the train passed the whole feature without a break.
 
     `profile` has arc lengths, headings and pitches at whole metres.
     """

@@ -94,8 +94,8 @@ class AlongTrack(LineCoordinates, NotebookTable):
 
     tracked: Tracked  #: Output of the filter, for the channels in `AntennaResult.corrected`.
     trajectory: Trajectory  #: Trajectory of the antenna.
-    #: Positions on the trajectory, shape (T,). Slightly beyond an end, they are moved to the end; farther out, they are
-    #: NaN.
+    #: Positions on the trajectory, shape (T,). Positions slightly beyond an end are moved to the end; positions farther
+    #: out are NaN.
     arc_m: Floats
     #: Direction: 1 toward rising chainage, -1 toward falling chainage, 0 if the speed is too small; shape (T,).
     direction: Codes

@@ -135,7 +135,7 @@ def _motion_inputs(
 
 
 def _named_as_wrong(reason: Bits, groups: Sequence[slice]) -> Masks:
-    """Return a mask (T, K) of satellites with individual errors; False if as many have errors as under spoofing."""
+    """Return a mask (T, K) of individual errors; False if as many satellites have errors as under spoofing."""
     wrong, gross = (reason & _WRONG_ALONE) != 0, (reason & int(Reason.GROSS_ERROR)) != 0
     named = wrong & (wrong.sum(axis=1, keepdims=True) <= _MOST_WRONG)
     for group in groups:

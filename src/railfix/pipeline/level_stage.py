@@ -241,8 +241,8 @@ def compute_araim(
     """Compute ARAIM levels of positions on the line, shape (T,).
 
     The integrity sigmas combine the URA of the message, the atmospheric errors of `Config.nominal` and the scaled range
-    noise. Sigmas of accuracy and thresholds have the URE, not the URA. `corrected` has the rejection reasons of all
-    stages.
+    noise. The sigmas for accuracy and for thresholds contain the URE instead of the URA. `corrected` has the rejection
+    reasons of all stages.
     """
     place = antennas.at_arc(solution.arc_m)
     sight, clocks, channels = _sight(corrected, place)
@@ -284,7 +284,7 @@ def compute_araim(
 
 
 def _sight(corrected: CorrectedRanges, place: Floats) -> tuple[Floats, Floats, Masks]:
-    """Return unit vectors (T, M, 3) and clock columns (M, G) of the M used channels of a chunk, and their mask (K,)."""
+    """Return unit vectors (T, M, 3), clock columns (M, G) and mask (K,) of the M used channels of a chunk."""
     channels = (corrected.reason == 0).any(axis=0)
     to_satellite = corrected.satellites.position_ecef_m[:, channels] - place[:, None, :]
     distance = np.linalg.norm(to_satellite, axis=2, keepdims=True)
@@ -303,7 +303,7 @@ def _rotate_geometry(geometry: AraimGeometry, axes: Floats) -> AraimGeometry:
 def with_map(geometry: AraimGeometry, plan_m: float, height_m: float, prior: float) -> AraimGeometry:
     """Return the geometry on a line (axes along, across and up), with the map as two additional observations.
 
-    `plan_m` and `height_m` are standard deviations of the map [m]; `prior` is the probability of a wrong map.
+    `plan_m` and `height_m` are standard deviations of the map errors [m]; `prior` is the probability of a wrong map.
     """
     epochs, ranges, unknowns = geometry.design.shape
     rows = np.zeros((epochs, 2, unknowns))

@@ -25,11 +25,11 @@ _LEAST_RATE_MPS: Final = 100.0
 #: A factor requires at least this number of satellites, and one more because the median rate is subtracted.
 _LEAST_SATELLITES: Final = 3
 #: With at least this number of satellites, a factor is valid even if one satellite deviates from it. With only four
-#: satellites, a cycle slip of one satellite changes the factors of all.
+#: satellites, a cycle slip of one satellite changes the ratios of all satellites.
 _MANY: Final = 6
 #: A satellite deviates from the factor if its own ratio differs from the median by more than this.
 _SPREAD: Final = 0.3
-#: Dopplers or phases are removed if their factor differs from 1 by more than this; the train's speed contributes.
+#: Dopplers or phases are removed if their factor differs from 1 by more than this; train speed also affects the factor.
 _RIGHT: Final = 0.5
 #: Phase changes are not computed over more than this time [s].
 _LONGEST_S: Final = 35.0
@@ -116,7 +116,7 @@ def rate_factor(observed_mps: Floats, expected_mps: Floats) -> Floats:
 
 
 def _held(factor: Floats, before: float, chosen: Masks) -> Floats:
-    """Return each epoch's factor (T,): the last known factor of the `chosen` epochs up to it, or else `before`."""
+    """Return the last known factor of the chosen epochs up to each epoch (T,); at first, the value of `before`."""
     values = np.concatenate([[before], factor])
     last = np.maximum.accumulate(np.where(np.isfinite(values), np.arange(len(values)), 0))
     return np.asarray(values[last][np.cumsum(chosen)])
@@ -142,7 +142,7 @@ def _phase_rates(
 
 
 def _without(corrected: CorrectedRanges, letters: Strings, bad: dict[int, Masks]) -> CorrectedRanges:
-    """Remove the Dopplers (kind 0) or phases (kind 1) that `bad` marks, with a mask (T, K) for each faulty kind."""
+    """Remove Dopplers and phases; `bad` has a mask (T, K) for each faulty kind (0: Dopplers, 1: phases)."""
     obs: Observations = corrected.observations
     of_channel: Indices = (obs.satellite.astype("<U1")[:, None] == letters).astype(np.intp)
     values = {"doppler_hz": obs.doppler_hz, "phase_cycles": obs.phase_cycles}

@@ -28,7 +28,7 @@ class RateSeries:
 
     time: Datetimes  #: Times at which the rates are valid, shape (K,).
     known: Datetimes  #: Times at which the rates became known, shape (K,).
-    distance_m: Floats  #: Wheel distance since the tick before the first, positive toward rising arc length; (K,).
+    distance_m: Floats  #: Wheel distance since the tick before tick 0, positive toward rising arc length; (K,).
     arc_m: Floats  #: Antenna position by dead reckoning with the wheel, shape (K,); NaN if unknown.
     turned_rad: Floats  #: Change of heading since the previous tick, positive if it turns right; shape (K,).
     climbed_rad: Floats  #: Change of pitch since the previous tick, positive with the nose up; shape (K,).
@@ -52,7 +52,7 @@ class FeatureState:
     metre: Integers = field(default_factory=lambda: np.empty(0, dtype=np.int64))
     heading_rad: Floats = field(default_factory=lambda: np.empty(0))  #: Heading at each metre, shape (M,).
     pitch_rad: Floats = field(default_factory=lambda: np.empty(0))  #: Pitch at each metre, shape (M,).
-    #: Position and standard deviation of the last accepted feature, and the wheel distance there [m]; None without one.
+    #: Position and sigma of the last accepted feature, and wheel distance there [m]; None before the first feature.
     last: tuple[float, float, float] | None = None
     done_m: float = float("nan")  #: Features up to this position have been compared; NaN at the start.
 

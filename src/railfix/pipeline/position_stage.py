@@ -245,8 +245,8 @@ def _status(
 ) -> Codes:
     """Return the status of each epoch, shape (T,), by the most serious condition that applies.
 
-    `counts` has the numbers of used and of redundant ranges. `failed` has masks of epochs whose ranges contradict the
-    map, whose ranges are inconsistent, and that have other possible positions. The shapes are (T,).
+    `counts` has the numbers of used and of redundant ranges. `failed` has three masks: epochs whose ranges contradict
+    the map, epochs whose ranges are inconsistent, and epochs with other possible positions. The shapes are (T,).
     """
     off_map, inconsistent, open_elsewhere = failed
     (n_used, redundancy), constrained, section = counts, solution.fix.constrained, solution.fix.section

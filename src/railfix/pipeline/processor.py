@@ -394,7 +394,7 @@ class EpochProcessor:
         return dict(zip(chunk.names, over_antennas(one_antenna, chunk.names), strict=True))
 
     def _curve_notes(self, headers: Mapping[str, ObservationHeader]) -> Iterator[str]:
-        """Yield a note for each log whose antenna or receiver is not the one of the C/N0 curve."""
+        """Yield a note for each log whose antenna or receiver is not the one for which the C/N0 curve is valid."""
         if (curve := self.setup.cn0_curve) is not None and "cn0" in self.config.screens:
             for name, header in headers.items():
                 yield from (f"{name}: {note}" for note in curve.notes_for(header))

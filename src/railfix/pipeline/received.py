@@ -146,7 +146,7 @@ def receive(
     navigation: Navigation | None = None,
     messages: Any = None,
 ) -> Received:
-    """Add new navigation records and messages to the received data; return `before` itself if there are none.
+    """Add new navigation records and messages to the received data; return `before` itself if nothing is new.
 
     `time` is the time of the next epoch, NaT if unknown. Messages that no epoch from `time` on can use are dropped.
     Repeated and expired records are dropped as well, except for a satellite's newest record. Newer ionospheric

@@ -112,9 +112,9 @@ def to_xarray(
     -------
     xarray.Dataset
         Variables over ``time`` for `POSITION_COLUMNS` and, with `tracked`, for `TRAIN_COLUMNS` (``filter_...``);
-        variables over ``time`` and ``channel`` for `CHANNEL_COLUMNS`. Each has ``units`` and a ``long_name``. Positions
-        are also given as ECEF coordinates ``ecef_m`` and ``conventional_ecef_m`` (axis ``xyz``), and as arc length
-        ``arc_m`` along the trajectory. ``satellite`` and ``signal`` are coordinates of ``channel``.
+        variables over ``time`` and ``channel`` for `CHANNEL_COLUMNS`. Each variable has ``units`` and a ``long_name``.
+        Positions are also given as ECEF coordinates ``ecef_m`` and ``conventional_ecef_m`` (axis ``xyz``), and as arc
+        length ``arc_m`` along the trajectory. ``satellite`` and ``signal`` are coordinates of ``channel``.
     """
     import xarray as xr
 

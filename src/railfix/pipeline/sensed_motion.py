@@ -147,8 +147,8 @@ def sensed_motion(
     distances = distance_m(pulses, np.concatenate([[start], when]), limits=tachometer)
     arc = state.arc_m + facing * (distances[1:] - distances[0])
     line_sine = facing * sine_at(arc)
-    # the speed from pulses is valid at the middle of the pulse interval. Without the correction by `ago`, it would be
-    # late by 0.065 s, which causes an error of 0.2 m in a slip of 3 s at 1 m/s2.
+    # the speed from pulses is valid at the middle of the pulse interval. Without the correction by `ago`, the speed
+    # would be late by 0.065 s, which causes an error of 0.2 m in a slip of 3 s at 1 m/s2.
     ago = seconds(when - speed.time)
     found, slip = find_slips(
         MotionSamples(
@@ -197,7 +197,7 @@ def _slope_and_bend(sine: Floats, turned_radps: Floats, speed_mps: Floats) -> tu
 def _wheel_acceleration(
     pulses: TachometerPulses, ticks: Integers, speed: PulseSpeeds, limits: TachometerLimits
 ) -> Floats:
-    """Return the wheel acceleration at the ticks; NaN after a lost tooth, to avoid that it counts as a slip."""
+    """Return the wheel acceleration at the ticks; NaN after a lost tooth, which would otherwise count as a slip."""
     when, earlier, before = ((ticks * _TICK_NS - ago).astype("datetime64[ns]") for ago in (0, _MEAN_NS, _FAULT_NS))
     acceleration = pulse_acceleration(pulse_speeds(pulses, earlier, limits=limits), speed)
     return np.where(faults_until(pulses, when) > faults_until(pulses, before), np.nan, acceleration)

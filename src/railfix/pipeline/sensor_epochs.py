@@ -67,7 +67,7 @@ class SensorLimits(Settings):
     tachometer: TachometerLimits = Field(default_factory=TachometerLimits)
     #: Detection of slip and slide by tachometer and inertial unit together.
     slip: SlipLimits = Field(default_factory=SlipLimits)
-    #: Distance of the ranging unit ahead of the vehicle's middle, or ahead of the antenna if there is no vehicle file.
+    #: Distance by which the ranging unit is ahead of the vehicle's middle or, without vehicle file, of the antenna.
     range_ahead_m: float = 0.0
     range_right_m: float = 0.0  #: Distance of the vehicle's ranging unit to the right of the antenna's path.
     range_above_m: float = 0.0  #: Height of the vehicle's ranging unit above the antenna.
@@ -289,7 +289,7 @@ def _ranges(ranging: StationRanges, edges: Datetimes, units: GroundUnits, lever_
 
 
 def _find_first_needed(pulses: TachometerPulses, end: np.datetime64, limits: SensorLimits) -> int:
-    """Return the index of the first pulse that speeds after `end` require."""
+    """Return the index of the first pulse that is needed for computing speeds after `end`."""
     last = int(np.searchsorted(pulses.time, end, side="right")) - 1
     if last < 1:
         return 0
@@ -312,7 +312,7 @@ def _mean_between(time: Datetimes, values: Floats, edges: Datetimes) -> tuple[Fl
 
 
 def _silent(sensor: str, samples: SensorSamples | None, epochs: int) -> Masks:
-    """Return a mask of intervals; the last is true if the sensor's samples stop before the end of this interval."""
+    """Return a mask of intervals, true only for the last interval, if the sensor's samples stop before it ends."""
     last = np.arange(epochs) == epochs - 1
     return last if samples is not None and sensor in samples.silent else np.zeros(epochs, dtype=np.bool_)
 

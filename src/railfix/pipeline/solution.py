@@ -59,8 +59,8 @@ class Solution(NotebookTable):
     along_sigma_m: Floats
     #: Positions from code and phase if ``Config.carrier`` is "float" or "fixed"; `arc_m` then has these positions.
     phase: PhasePositions | None
-    protection: ProtectionResult | None  #: Protection levels along the line; None if off.
-    map_offset: MapOffset  #: Mean offset from the line of the last minutes' 3-D positions.
+    protection: ProtectionResult | None  #: Protection levels along the line; None if the levels are off.
+    map_offset: MapOffset  #: Mean offset of the last minutes' 3-D positions from the line.
     off_map: Masks  #: True where the train is away from the line (`railfix.pipeline.off_map`); shape (T,).
     araim: AraimResult | None = None  #: ARAIM levels; None without an integrity support message.
 

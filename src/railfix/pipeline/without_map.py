@@ -91,7 +91,7 @@ class RangesWithoutMap:
     corrected: CorrectedRanges
     #: Ranges with sigmas that include satellite and atmospheric errors; ranges that must not be fitted have weight 0.
     ranges: Ranges
-    near_ecef_m: Floats  #: Approximate position; NaN if the codes give none; shape (T, 3).
+    near_ecef_m: Floats  #: Approximate position, shape (T, 3); NaN if the codes determine none.
     no_position: Codes  #: `NoPosition` from the numbers of codes, records and satellites; shape (T,).
 
 

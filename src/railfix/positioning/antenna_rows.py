@@ -35,12 +35,12 @@ class AntennaRows:
 
     @property
     def sigma_plan_m(self) -> float:
-        """Lateral standard deviation of the map [m]."""
+        """Standard deviation of the lateral map error [m]."""
         return self.indices[0].trajectory.sigma_plan_m
 
     @property
     def sigma_height_m(self) -> float:
-        """Standard deviation of the map heights [m]."""
+        """Standard deviation of the vertical map error [m]."""
         return self.indices[0].trajectory.sigma_height_m
 
     @property
@@ -49,7 +49,7 @@ class AntennaRows:
         return [(index.trajectory, rows) for index, rows in zip(self.indices, self.parts, strict=True)]
 
     def apart(self, function: Callable[..., Value], *of_antennas: Sequence[Any]) -> list[Value]:
-        """Call a function for each antenna with its search index, its rows, and its item of each list; return all."""
+        """Call a function with each antenna's search index, rows and item of each list; return all results."""
         return [function(*each) for each in zip(self.indices, self.parts, *of_antennas, strict=True)]
 
     def each(self, function: Callable[..., Value], *of_antennas: Sequence[Any]) -> Value:

@@ -39,7 +39,7 @@ def approximate_position(
     The positions are used to compute atmospheric delays. The iteration of every epoch starts from the middle of the
     line, so that epochs are independent. Unless far from the line, the 3-D position is moved to the nearest trajectory
     point. Without a 3-D position, or with a gross error that cannot be identified, the best-fitting point of the line
-    is returned. If no point fits, this is the middle of the line.
+    is returned. If no point fits, the middle of the line is returned.
 
     Parameters
     ----------

@@ -44,8 +44,8 @@ class DopplerSpeedLimits(Settings):
     #: Noise of a Doppler at 45 dB-Hz: ``sigma^2 = floor^2 + (zenith 10^((45 - min(C/N0, 50)) / 20))^2``. Only the
     #: relative noise of Dopplers affects the speed, because the noise scale is estimated from the residuals of the log.
     zenith_mps: float = Field(default=0.03, gt=0)
-    #: Largest normalised residual of a Doppler that is not rejected (w-test of Baarda, 1968). If several Dopplers
-    #: exceed it, the largest residual is rejected first.
+    #: Dopplers with normalised residuals above this are rejected one by one, the largest residual first (w-test of
+    #: Baarda, 1968).
     outlier: float = Field(default=3.5, gt=0)
     most_rejected: int = Field(default=8, ge=0)  #: Largest number of Dopplers rejected per epoch.
     min_satellites: int = Field(default=4, ge=3)  #: Epochs with fewer Dopplers than this have no speed.
@@ -77,7 +77,7 @@ class DopplerSpeed:
     speed_mps: Floats
     sigma_mps: Floats  #: Standard deviation of `speed_mps`, shape (T,).
     clock_drift_mps: Floats  #: c times the receiver clock drift, shape (T,).
-    residual_mps: Floats  #: Measured minus fitted range rate of used and rejected Dopplers, shape (T, K); else NaN.
+    residual_mps: Floats  #: Measured minus fitted range rate, shape (T, K); NaN if neither used nor rejected.
     used: Masks  #: True for Dopplers used in the fit, shape (T, K).
     rejected: Masks  #: True for Dopplers rejected as outliers, shape (T, K).
     n_used: Integers  #: Number of Dopplers used, shape (T,).

@@ -155,7 +155,7 @@ def disagreeing(ranges: Ranges, start_ecef_m: Floats) -> Masks:
 
 _COARSE_M: Final = 100.0  #: Spacing of line points in the coarse scan [m].
 _FINE_M: Final = 12.5  #: Spacing of line points in the fine scan [m].
-#: Difference between clocks of constellations that is normally not exceeded [m]; recordings have up to 71 m.
+#: Clocks of constellations normally differ by at most this [m]; in recordings, they differ by up to 71 m.
 _CLOCKS_APART_M: Final = 200.0
 #: A clock with one or two ranges is not used if it differs from the median clock by more than this [m].
 _CLOCK_AWAY_M: Final = 600.0

@@ -28,8 +28,8 @@ class RobustFitLimits(Settings):
 
     keep: float = Field(default=1.5, gt=0)  #: Residuals up to this multiple of the scale have full weight.
     reject: float = Field(default=4.0, gt=0)  #: Residuals above this multiple of the scale have zero weight.
-    #: Number of reweightings. For the demonstration with an error of 20 m on one satellite, the fifth changes no
-    #: decision.
+    #: Number of reweightings. For the demonstration with an error of 20 m on one satellite, the fifth reweighting
+    #: changes no decision.
     iterations: int = Field(default=5, ge=1)
 
 

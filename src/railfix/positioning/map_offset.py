@@ -218,8 +218,8 @@ def terms_of_epochs(
 def means_of_windows(
     sums: Floats, sigma_plan_m: float, sigma_height_m: float, detectable_sigmas: float
 ) -> tuple[Floats, Floats, Floats, Floats]:
-    """Compute from window sums (T, 9) mean offset (T, 2), covariance (T, 2, 2), statistic (T,) and detectable offsets
-    (T, 2), described at `MapOffset`.
+    """Return mean offset (T, 2), covariance (T, 2, 2), statistic (T,) and detectable offsets (T, 2), which `MapOffset`
+    describes. `sums` are window sums, shape (T, 9).
     """
     of_noise = _inverse_2x2(sums[:, [0, 1, 1, 2]].reshape(-1, 2, 2))
     mean = np.einsum("tij,tj->ti", of_noise, sums[:, 3:5])

@@ -27,8 +27,8 @@ class Windows(NamedTuple):
     def of(
         cls, time: Datetimes, parts: Sequence[slice], before: Sequence[Dated], *, window_s: float, least_epochs: float
     ) -> Windows:
-        """Compute the ages. For each antenna, `parts` contains the rows of the antenna, and `before` contains its last
-        epoch of the previous chunk.
+        """Compute the ages. `parts` contains the rows of each antenna, and `before` contains the last epoch of each
+        antenna in the previous chunk.
 
         A window has the length `window_s` or `least_epochs` epochs, whichever is longer. The time between two epochs,
         even after a gap, therefore counts as at most 1 / `least_epochs` of a window.

@@ -97,7 +97,7 @@ def position_on_line(
     Within a section, the iteration uses Newton steps in d, with the receiver clocks eliminated. A step beyond an end of
     the section stops at this end, and the iteration continues in the neighbouring section. If the steps in two
     neighbouring sections lead back to their common point, this point is the solution. Positions beyond an end of the
-    line are clamped to the end; `overshoot_m` is the distance beyond it.
+    line are clamped to the end; `overshoot_m` is their distance from the end before clamping.
 
     Parameters
     ----------

@@ -27,8 +27,8 @@ class NoiseScaleLimits(Settings):
     """Limits of the estimation of noise scales."""
 
     #: Time constant of exponential forgetting. The default is five correlation times of code errors (about 20 s; the
-    #: correlation is 0.6 after 10 s on recordings). This contains enough independent samples for a mean, and the effect
-    #: of one street or station decays before the next one.
+    #: correlation is 0.6 after 10 s on recordings). This window contains enough independent samples for a mean, and the
+    #: effect of one street or station decays before the next one.
     window_s: float = Field(default=100.0, gt=0)
     #: Weight of the prior scale, as a number of redundant ranges. The default corresponds to two or three epochs. With
     #: infinity, the scale is always the prior scale.
@@ -49,7 +49,7 @@ class NoiseState:
     age: float = 0.0  #: Time from the start of the log to the last epoch, in window lengths (`noise_windows`).
     #: Weighted sum of squared residuals, and sum of degrees of freedom, of ranges kept by the robust fit, shape (2,).
     robust: Floats = field(default_factory=lambda: np.zeros(2))
-    #: The sums of `robust`, but for the ranges accepted by RAIM, shape (2,).
+    #: The same two sums as in `robust`, computed from the ranges accepted by RAIM, shape (2,).
     remaining: Floats = field(default_factory=lambda: np.zeros(2))
 
 

@@ -37,7 +37,7 @@ class SearchIndex:
 
     @cached_property
     def stretches(self) -> tuple[Indices, Floats, Indices]:
-        """Middle points and radii [m] of all stretches, shape (S,), and each stretch length's first index in them."""
+        """Middle points and radii [m] of all stretches, shape (S,), and index of the first stretch of each length."""
         middles, radii = zip(*self.levels, strict=True)
         return np.concatenate(middles), np.concatenate(radii), np.cumsum([0, *map(len, middles)])
 

@@ -42,7 +42,7 @@ class PhaseLimits(Settings):
     #: one. The variance of the ambiguities is therefore multiplied by correlation time / interval, up to the variance
     #: from codes alone. Positions are unaffected. Use 0 for white noise, for example in simulations.
     correlation_s: float = Field(default=20.0, ge=0)
-    #: Number of linearisations. Each has a separate state, so that results do not depend on the division into chunks.
+    #: Number of linearisations, each with a separate state, so that results do not depend on the division into chunks.
     passes: int = Field(default=2, ge=1)
     #: Ambiguities are fixed if the probability of a wrong integer is at most this. Fixing requires a base station.
     integer_risk: float = Field(default=1e-4, gt=0, lt=0.5)
@@ -59,7 +59,7 @@ def number_hops(time: Datetimes, limits: PhaseLimits) -> Integers:
 
 
 def count_repeats(time: Datetimes, limits: PhaseLimits) -> Floats:
-    """Return the correlation time divided by the interval since the previous epoch, at least 1, shape (T,)."""
+    """Return the larger of 1 and correlation time / time since the previous epoch, for each epoch, shape (T,)."""
     step = np.append(np.nan, seconds(np.diff(time)))
     with np.errstate(divide="ignore"):
         share = limits.correlation_s / step
@@ -168,7 +168,7 @@ def assemble_positions(
 
 
 _VECTORS: Final = 12  #: Number of compared integer vectors.
-#: Fractions of the ambiguity differences to fix together, strongest phases first. They are tried in this order.
+#: Fractions of the ambiguity differences (strongest phases first) to fix together, in the order of the attempts.
 _SHARES: Final = (1.0, 0.75, 0.5)
 
 
@@ -203,11 +203,11 @@ def fix_integers(
     covariance_m2 : ndarray, shape (A, A) [m^2]
         Noise covariance.
     strength : ndarray, shape (A,)
-        Weight of each phase. The phase with the largest weight is the reference of its group.
+        Weight of each phase. The phase with the largest weight in a group is the reference of this group.
     channels : IntegerChannels
         Wavelength and group of each arc.
     map_sigma_m : tuple of float
-        Standard deviation of the map across and in height [m].
+        Standard deviations of the map error across and in height [m].
     largest_risk, no_integer_prior : float
         See `PhaseLimits`.
     """
@@ -249,7 +249,7 @@ def _fix_pairs(
     map_sigma_m: Floats,
     no_integer_prior: float,
 ) -> Fixed | None:
-    """Fix the differences of `pairs` to the most probable integers; return None if their covariance is singular."""
+    """Fix the differences of `pairs` to their most probable integers; return None for a singular covariance."""
     value, noise = ambiguities
     rows = np.arange(len(wavelength_m))
     design = np.zeros((len(rows), len(value)))

@@ -52,13 +52,13 @@ class SlipReason(IntFlag):
 class CycleSlipLimits(Settings):
     """Limits of the slip tests, for an interval dt [s].
 
-    The Doppler test rejects a change above ``doppler_m + doppler_mps dt + jerk_mps3 dt^3 / 12``. The three terms are
-    phase noise, mean Doppler noise, and the error of the trapezoidal rule for a motion with this jerk. A slip of one
-    cycle on L1 (0.19 m) is detected for intervals up to about 1 s, a slip of two cycles for intervals up to 1.5 s. The
-    test on the track (`continuity.track_jumps`) does not depend on the jerk.
+    The Doppler test detects a slip if phase change and Dopplers disagree by more than ``doppler_m + doppler_mps dt +
+    jerk_mps3 dt^3 / 12``. The three terms are phase noise, mean Doppler noise, and the error of the trapezoidal rule
+    for a motion with this jerk. Slips of one L1 cycle (0.19 m) are detected for intervals up to about 1 s, slips of two
+    cycles up to 1.5 s. The test on the track (`continuity.track_jumps`) does not depend on the jerk.
     """
 
-    #: An arc ends at a longer interval than this. Station logs have intervals of 30 s.
+    #: An arc ends if the interval between epochs exceeds this. Station logs have intervals of 30 s.
     max_gap_s: float = Field(default=31.0, gt=0)
     #: Constant part of the Doppler test limit. For recorded data at 1 Hz, the median of phase change minus change
     #: predicted from Dopplers is 0.01 to 0.04 m.
@@ -234,7 +234,7 @@ class SmoothingLimits(Settings):
     #: With "own", the mean change of code minus phase over all channels counts as a clock change. It is subtracted
     #: before averaging and added afterwards. Telephones require "own", because their codes jump together by tens of
     #: metres. In a town, smoothing with "own" reduced the 95 % error along the line from 10.8 to 7.0 m; with "shared",
-    #: it was 50 m. With other receivers, "own" was as accurate as "shared".
+    #: this error was 50 m. With other receivers, "own" was as accurate as "shared".
     clocks: Literal["own", "shared"] = "own"
 
 
@@ -283,7 +283,7 @@ def smooth_codes(
     """Return codes smoothed by the phase along unbroken arcs.
 
     The weight of the n-th code of an arc is the greater of 1/n and dt / window. To avoid accumulated rounding errors
-    (phases of 1e8 m are resolved to 1.5e-8 m), the recursion uses code minus phase, minus its first value on the arc.
+    (phases of 1e8 m are resolved to 1.5e-8 m), the recursion uses the change of code minus phase on the arc.
 
     Parameters
     ----------
@@ -299,8 +299,8 @@ def smooth_codes(
     Returns
     -------
     ndarray, shape (T, M) [m]
-        Smoothed codes. Without a phase, and at the first epoch of an arc, this is the raw code. Where the code is
-        missing, the smoothed code is extrapolated by the phase of the arc; it is NaN without an arc.
+        Smoothed codes. Without a phase, and at the first epoch of an arc, the raw code is returned. Where the code is
+        missing, the smoothed code is extrapolated by the phase of the arc; if there is no arc, it is NaN.
     SmoothingState
         State for the next chunk. The division into chunks changes the result only by rounding errors (1e-9 m).
     """

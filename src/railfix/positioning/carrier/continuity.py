@@ -54,7 +54,7 @@ def rows_before(before: ChannelKeys, now: ChannelKeys) -> Indices:
 def number_arcs(
     slip: Masks, has_phase: Masks, satellite: Strings, signal: Strings, state: ArcState | None = None
 ) -> tuple[Integers, ArcState]:
-    """Return the number of the arc of each phase.
+    """Return the arc number of each phase.
 
     Parameters
     ----------
@@ -218,7 +218,7 @@ def track_jumps(
 def _reject_jumps(
     design: Floats, change: Floats, judged: Masks, sigma: Floats, aside: Floats, limits: ContinuityLimits
 ) -> tuple[Masks, Floats, Floats, Floats, Masks]:
-    """Reject channels with the largest residuals one by one until the others agree.
+    """Reject channels with the largest residuals one by one until the remaining channels agree.
 
     Return a mask of the kept channels, the residuals of all channels, the step along the line, the variance of the
     step, and a mask of the epochs whose kept channels agree. Without redundancy, all channels are kept.
@@ -271,7 +271,7 @@ def _fit(design: Floats, change: Floats, kept: Masks, sigma: Floats, prior: Floa
 def _worst_out(
     design: Floats, change: Floats, sigma: Floats, prior: Floats, kept: Masks, limits: ContinuityLimits
 ) -> tuple[Masks, Masks]:
-    """Repeatedly reject the largest residual; return masks of kept channels and of epochs at which these agree."""
+    """Repeatedly reject the largest residual; return masks of kept channels and of epochs whose kept channels agree."""
     kept = kept.copy()
     active = np.arange(len(kept))
     for _ in range(limits.max_rejected + 1):

@@ -183,11 +183,11 @@ def _segment(
 def _ambiguities(
     matrix: Floats, right: Floats, arc_id: Integers, memory: Memory, *, held: bool
 ) -> tuple[Floats, Floats, ArcAmbiguities, Memory]:
-    """Return the corrections to the ambiguities' first values at each epoch, their covariances, arcs and memory.
+    """Return corrections to the ambiguities' first values and the covariances for each epoch; also arcs and memory.
 
-    The shapes are (T, M, 3) and (T, M, M). The ambiguities are computed from the normal equations of the epoch and all
-    earlier epochs. Arcs and memory refer to the time after the last epoch. If `held` is true, the mean of the
-    ambiguities is zero (`inverse_of_arcs`).
+    The corrections have the shape (T, M, 3), the covariances (T, M, M). The ambiguities are computed from the normal
+    equations of the epoch and all earlier epochs. Arcs and memory refer to the time after the last epoch. If `held` is
+    true, the mean of the ambiguities is zero (`inverse_of_arcs`).
     """
     count, row = len(memory.arc_id), np.arange(len(arc_id))[:, None]
     # channels without a phase are collected in an extra row and column

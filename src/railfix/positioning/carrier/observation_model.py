@@ -148,7 +148,7 @@ def linearise(
 
 
 def _level(values: Floats, weight: Floats) -> tuple[Floats, Floats]:
-    """Subtract each epoch's weighted mean; return differences, 0 where the weight is 0, and means, shape (T,)."""
+    """Return values minus each epoch's weighted mean (0 where the weight is 0), and the means, shape (T,)."""
     used = np.where(weight > 0, values, 0.0)
     total = weight.sum(axis=1)
     mean = (weight * used).sum(axis=1) / np.where(total > 0, total, 1.0)
