@@ -29,10 +29,14 @@ def main() -> NoReturn:
         from railfix.cli.command import run_program
 
         run_program(app)
-    except SystemExit as end:
+    except (SystemExit, RuntimeError) as error:
+        # Python 3.11 replaces an exit during the creation of a class by a RuntimeError.
+        end = error if isinstance(error, SystemExit) else error.__cause__
+        if not isinstance(end, SystemExit):
+            raise
         if end.code == _INTERRUPTED:
             print("railfix: interrupted; unfinished files were removed, finished files are kept", file=sys.stderr)
-        raise
+        raise end from None
 
 
 if __name__ == "__main__":

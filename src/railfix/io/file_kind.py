@@ -45,7 +45,7 @@ _TEXT: Final[dict[FileKind, re.Pattern[bytes]]] = {
     "sp3": re.compile(rb"\A#[a-d][PV]\d"),
     "ifc": re.compile(rb"\A\s*ISO-10303-21;"),
     "rdf": re.compile(
-        rb'\A\s*(?:#.*\n\s*)*(?:@prefix|@base|PREFIX\s|BASE\s|<https?:[^>]*>\s+<|\[\s*\{|\{\s*"@(?:context|graph)")'
+        rb'\A\s*(?:#.*\n\s*)*(?:@prefix|@base|PREFIX\s|BASE\s|(?:<https?:[^>]*>|_:\S+)\s+<|\[\s*\{|\{\s*"@(?:context|graph)")'
     ),
     "geojson": re.compile(rb"\A\s*\{"),
     "dxf": re.compile(rb"\A\s*(?:999\s*\n.*\n\s*)*0\s*\n\s*SECTION"),
