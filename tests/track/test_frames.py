@@ -114,7 +114,7 @@ def test_japan_moves_by_a_semidynamic_correction_where_its_file_is_given(tmp_pat
     later, named = track_at(track, time, parameters=tmp_path / "s.par", epoch=2024.5)
     step = np.linalg.norm(later.ecef_m - moved.ecef_m, axis=1)
     assert 0.03 < step[0] < 0.07  # two years of the Eurasian plate in the ITRF
-    assert "since its epoch 2024.5" in named.method
+    assert "since the map epoch 2024.5" in named.method
     # taken by cells of 0.001 degrees: within millimetres of each point's own
     sloped, _ = track_at(track, time, parameters=_semidynamic(tmp_path / "slope.par", slope=0.001))
     correction = pytest.importorskip("jgdtrans").loads((tmp_path / "slope.par").read_text(), format="SemiDynaEXE")

@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from railfix.evaluate import Evaluation
 
 
-#: Maximum number of printed rows of the table by section.
+#: Maximum number of rows that are printed of each table of groups, such as the table by section.
 _MOST_SECTIONS: Final = 20
 #: Beginnings of the names of the tables that are printed without ``--verbose``.
 _MAIN_TABLES: Final = ("figures-of-merit", "figures-by-configuration", "levels", "above-level")

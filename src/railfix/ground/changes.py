@@ -82,7 +82,7 @@ def _may_run(known: TrainInterval, *, lapsed: bool) -> str | None:
     if known.runs_by is None or lapsed:
         return None
     return (
-        f"train {known.train} has not reported that it obeys the order to brake, and may still run: wait "
+        f"train {known.train} has not reported that it obeys the order to brake, and may still be moving: wait "
         "for that report"
     )
 

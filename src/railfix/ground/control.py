@@ -81,7 +81,7 @@ class ControlCentre:
     reports: int = 0
     rejected: Counter[str] = field(default_factory=Counter)  #: Number of rejected reports, by reason.
     stop_s: float | None = None
-    stops: dict[int, StopOrder] = field(default_factory=dict)  #: Newest order to stop of each train that is stopped.
+    stops: dict[int, StopOrder] = field(default_factory=dict)  #: For each stopped train, its newest order to stop.
     #: Commits to the store; in a running centre, they are carried out in a thread.
     commits: Commits = field(default_factory=Commits)
     #: Function that requests the detection of a set of points; `Supervision.set_detected` processes the answer.
@@ -413,7 +413,7 @@ class ControlCentre:
 
 
 def list_orders(centre: ControlCentre) -> dict[str, Order]:
-    """Return the function that carries out each order of the page, by name of the order."""
+    """Return a mapping from the name of each order that the page offers to the function that carries out the order."""
     desk = OrderDesk(
         supervision=centre.supervision, clock=centre.clock, log=centre.log, release=centre.release, stop=centre.stop
     )

@@ -189,7 +189,9 @@ class OrderDesk:
         return None
 
     def detect(self, values: Values, by: str = "") -> str | None:
-        """Process the detection of a section: true if occupied, false if free, null if unknown; changes are logged."""
+        """Process a report on a section: true for an occupied section, false for a free section, null for an unknown
+        state. Changes are logged.
+        """
         name, occupied = str(values.get("section", "")), values.get("occupied")
         if name not in self.supervision.layout.sections:
             return f"no such section: {name!r}"

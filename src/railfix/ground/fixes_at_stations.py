@@ -164,7 +164,7 @@ def read_fixes(logs: Sequence[str], nav: Sequence[Path], points: Sequence[str], 
 
 
 def fixes_of_positions(logs: Sequence[PositionLog], points_ecef_m: Floats) -> StationFixes:
-    """Return the fixes in logs of other programs or services (RTK, PPP-RTK), with one log per receiver.
+    """Return the fixes in logs of other programs or services (RTK, PPP-RTK). There is one log for each receiver.
 
     `n_satellites` is 0, because it is unknown whether the receivers used the same satellites. Raise MismatchError if
     the logs have no epoch in common.

@@ -59,8 +59,8 @@ class TrainInterval:
     #: if the newest report does not confirm the train's integrity and length.
     claimed_m: float | None = None
     line: int | None = None  #: Line number in the train's reports; None before the first report.
-    #: Time of the newest position by the train's clock; None before the first report since the train's unit was
-    #: started.
+    #: Time of the newest position by the train's clock. It is None until the train's unit has sent its first report
+    #: after it was started.
     measured_ns: int | None = None
     speed_mps: float | None = None  #: Speed of the newest report; None if unknown.
     #: Ends of the train according to the newest report with a position, even if that report contradicts the record;

@@ -244,7 +244,9 @@ def _write_one(
     common: Floats,
     tails: _Tails,
 ) -> None:
-    """Write a hypothesis from the effect of the excluded channels; the error of an undetectable fault is unbounded."""
+    """Write offset, sigma and ratio of hypothesis `at` to `tails`, from the effect of excluding its channels. The sigma
+    is infinite if the fault is undetectable.
+    """
     tails.offset[t, at], tails.sigma[t, at], tails.ratio[at] = separate(
         removed[0], removed[1], removed[2], removed[3], more, common
     )

@@ -250,7 +250,8 @@ def risk_off_tangent(
     """Return an upper bound of the probability that the true position is farther than `clear_m` away.
 
     At a horizontal distance D, a quadratic form exceeds its value at the position by at least ``(D - |c|)^2 / trace(C)
-    - c . s``. Here c and C are the horizontal parts of the minimum point and of the inverse matrix, and s is the slope.
+    - c . s``. Here c and C are the horizontal parts of the quadratic form's minimum point and inverse matrix, and s is
+      the slope.
     Without the channels J, whose rows of the design are F_J, the matrix is at least ``1 - tau`` times the matrix of all
     channels, with ``tau = trace(F_J C F_J^T S_JJ^-1)``. In most epochs, the bound with the largest tau of all single
     channels and pairs is sufficient. In other epochs, each subset is bounded separately.

@@ -176,7 +176,9 @@ def points_in_balls(
 
 @inner
 def _floor(vertex: int, q: float, slope: Floats, matrix: Floats, tangent: Floats, length_m: Floats) -> float:
-    """Return the minimum of the quadratic form of q on the two sections that meet at a point."""
+    """Return the minimum of the quadratic form on the two sections that meet at the point `vertex`, where the form is
+    `q`.
+    """
     floor = q
     for side in range(2):
         section, sign = vertex - side, 1.0 - 2.0 * side

@@ -60,7 +60,9 @@ class Feature:
 
 
 def line_series(trajectory: Trajectory) -> LineSeries:
-    """Compute gradient and curvature of a trajectory over chords of `BASE_M`, like measurements on two bogies."""
+    """Compute gradient and curvature of a trajectory over chords of the length `BASE_M`, like a car on two bogies that
+    are `BASE_M` apart.
+    """
     half = 0.5 * BASE_M
     arc = np.arange(half, float(trajectory.arc_m[-1]) - half, STEP_M)
     front, rear = trajectory.at_arc(arc + half), trajectory.at_arc(arc - half)

@@ -50,7 +50,7 @@ BASES: Final[tuple[str, str]] = ("measured", "indicative")
 
 
 def choose_basis(config: Config) -> str:
-    """Return the entry of `BASES` for the levels of a run."""
+    """Return the entry of `BASES` for the protection levels of a run."""
     return BASES[0] if config.risk.priors == "measured" else BASES[1]
 
 

@@ -163,7 +163,8 @@ _CLOCK_AWAY_M: Final = 600.0
 _BLOCK: Final = 2_000_000
 #: The least cost is clear if all alternatives cost more by this fraction of `GROSS_M`.
 _CLEAR: Final = 0.7
-#: Gross errors are identified at a point of the line only if this many redundant ranges agree with it.
+#: The search along the line identifies gross errors only at points with which at least this many redundant ranges
+#: agree.
 _LEFT_ON_LINE: Final = 2
 
 

@@ -132,7 +132,7 @@ def position_on_line(
 def _on_line(
     ranges: Ranges, trajectory: Trajectory, start: Indices, limits: ConstrainedLimits
 ) -> tuple[Floats, Indices, Floats, Floats, Floats, Integers]:
-    """Return arc lengths, and the results of `_from` with epochs on the last axis.
+    """Return arc lengths, and the results of `_from`; all arrays have epochs on their last axis.
 
     If a position is clamped to an end of a closed line, the iteration is repeated from the point where the line passes
     this end again, and the better fit is returned.

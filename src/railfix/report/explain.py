@@ -166,7 +166,7 @@ def _axes(folder: RunFolder, single: Mapping[str, Any]) -> Floats:
 
 
 def _map_sigma_m(folder: RunFolder) -> tuple[float, float]:
-    """Return the standard deviations of the map across and above the line [m], from the settings or the map."""
+    """Return the standard deviations of the map's lateral and vertical errors [m], from the settings or the map."""
     settings, facts = folder.record.get("settings_used") or {}, folder.track_facts
     return tuple(  # type: ignore[return-value]
         float(settings.get(f"map_{name}_sigma_m") or facts[f"sigma_{name}_m"]) for name in ("plan", "height")

@@ -47,7 +47,8 @@ class DopplerLimits(Settings):
     step_m: float = Field(default=1.5, gt=0.0, allow_inf_nan=False)
     #: Interval up to which the limit is constant. The default allows for one lost epoch at P1's interval of 0.1 s.
     short_interval_s: float = Field(default=0.2, gt=0.0, allow_inf_nan=False)
-    #: Time over which the receiver smooths its pseudoranges. With 1 s, the fixed limit is 2.9 m at an interval of 1 s.
+    #: Time over which the receiver smooths its pseudoranges. With 1 s, the limit of the mode "fixed" is 2.9 m for
+    #: epochs that are 1 s apart.
     correlation_s: float = Field(default=1.0, gt=0.0, allow_inf_nan=False)
     #: Largest jerk of the vehicle [m/s^3]; trains stay below 1.
     jerk_mps3: float = Field(default=1.0, ge=0.0, allow_inf_nan=False)

@@ -174,7 +174,7 @@ class InterSystemSettings(ScenarioSettings):
 class NoiseSettings(ScenarioSettings):
     """Time-correlated receiver noise; the standard deviations are in `ReceiverSettings`."""
 
-    code_correlated_share: Share = 0.0  #: Fraction of the variance of the code noise that is correlated in time.
+    code_correlated_share: Share = 0.0  #: Time-correlated fraction of the code noise variance.
     #: Correlation time of the correlated code noise: 1 / (4 B) for a code loop of noise bandwidth B, 1 s for 0.25 Hz.
     code_correlation_time_s: Positive = 1.0
     #: Standard deviation of the Gauss-Markov variation of C/N0, independent for each channel.

@@ -37,7 +37,7 @@ CHUNK_EPOCHS: Final = 2000  #: Number of epochs in a chunk.
 _LOOK_S: Final = 60.0  #: Interval at which satellite elevations are compared with the cutoff [s].
 _RATE_S: Final = 0.005  #: Range rates are computed from differences over twice this time [s].
 _SIGMA_AT_DBHZ: Final = 45.0  #: C/N0 to which the sigmas of `ReceiverSettings` refer [dB-Hz].
-_BEST_DBHZ: Final = 50.0  #: Above this C/N0, the noise is constant [dB-Hz].
+_BEST_DBHZ: Final = 50.0  #: C/N0 above which the noise is constant [dB-Hz].
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -262,7 +262,7 @@ def _by_parameters(
     method = f"semi-dynamic correction {path}"
     if epoch is None:
         return moved, method, (f"map: JGD2011 moved by the {method}; its epoch is not given (--map-epoch)",)
-    method += f", motion of the plate {plate} since its epoch {epoch:g}"
+    method += f", motion of the plate {plate} since the map epoch {epoch:g}"
     return _by_plate(moved, plate, year - epoch), method, (f"map: JGD2011 moved by the {method}",)
 
 

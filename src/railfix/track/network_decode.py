@@ -357,7 +357,7 @@ def _forward(
 
 
 def _sequence(probability: Floats, gains: Floats) -> Indices:
-    """Return the sequence that maximises the sum of `gains`, as columns of `probability`."""
+    """Return the column of `probability` at each step, such that the sum of `gains` over the steps is largest."""
     if len(probability) == 1:
         return np.asarray(probability.argmax(axis=1))
     nothing = np.zeros(probability.shape[1])

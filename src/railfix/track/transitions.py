@@ -55,7 +55,7 @@ class OrdinateElement:
 
     @cached_property
     def _knots(self) -> tuple[Floats, Floats]:
-        """Abscissae of the interval limits on the tangent, and the curve lengths up to these abscissae [m]."""
+        """Limits of the intervals, as abscissae on the tangent, and the curve length up to each limit [m]."""
         x = np.linspace(0.0, self.tangent_m, _PIECES + 1)
         return x, np.concatenate([[0.0], np.cumsum(self._length_between(x[:-1], x[1:]))])
 

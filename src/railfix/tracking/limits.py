@@ -70,7 +70,8 @@ class TrackingLimits(Settings):
     start_separation_m: float = Field(default=60.0, gt=0)  #: Smallest distance between positions that a search finds.
     #: "on" to compute a protection level with a bank of sub-filters, about one per satellite.
     level: Literal["on", "off"] = "on"
-    #: Interval between epochs that the sub-filters use. Codes of neighbouring epochs have nearly the same errors.
+    #: The sub-filters use epochs that are at least this time apart. Codes of neighbouring epochs have nearly the same
+    #: errors.
     level_period_s: float = Field(default=1.0, gt=0)
     #: Largest acceleration assumed between epochs that the sub-filters use. Emergency braking reaches 3 m/s2 (magnetic
     #: track brakes). After a rejected speed, the range of accepted speeds grows at this rate.

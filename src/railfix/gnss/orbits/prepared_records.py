@@ -339,7 +339,9 @@ _MESSAGE_OF: Final = {
 
 
 def _labels(satellite: str, signal: str) -> tuple[str, str]:
-    """Return a channel's preferred lookup label (with the signal's clock and delay) and alternative label."""
+    """Return the lookup label of the records whose clock and group delay refer to the channel's signal, and the label
+    of the records that are used without them.
+    """
     if satellite[0] == "E":
         messages = ("FNAV", "INAV") if signal[:1] == "5" else ("INAV", "FNAV")
         return f"{satellite} {messages[0]}", f"{satellite} {messages[1]}"

@@ -56,7 +56,7 @@ class Sign(IntFlag):
     LEFT_MAP = 1 << 9
     #: The distance travelled according to GNSS deviates from the wheel distance.
     WHEEL_PARTS = 1 << 10
-    #: A common time-tag error explains the ranges.
+    #: A time-tag error that all ranges share explains their residuals.
     TIME_TAGS = 1 << 11
     #: All positions of the last minute failed a check.
     CONTRADICTED = 1 << 12
@@ -136,7 +136,7 @@ class InterferenceLimits(Settings):
     wheel_change: float = Field(default=0.001, gt=0)
     #: Wheel acceleration above which a slip is assumed and the comparison restarts. Adhesion allows 1 to 1.5 m/s^2.
     wheel_acceleration_mps2: float = Field(default=1.6, gt=0)
-    #: Suspected jamming, time-tag errors and positions off the map stay reported for this time after the last sign.
+    #: Suspected jamming, time-tag errors and positions off the map remain reported for this time after their last sign.
     jamming_release_s: float = Field(default=10.0, ge=0)
     #: Suspected spoofing stays reported for this time after the last sign. A jump is visible at one epoch only, but the
     #: cause of the jump persists.

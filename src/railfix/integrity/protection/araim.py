@@ -86,7 +86,8 @@ class AraimLevels:
     #: probability of unmonitored faults exceeds the risk.
     level_m: Floats
     sigma_int_m: Floats  #: Integrity standard deviations of the position from all observations, shape (T, Q).
-    sigma_acc_m: Floats  #: Accuracy standard deviations of the position from all observations, shape (T, Q).
+    #: Standard deviations, for accuracy, of the position that is computed from all observations; shape (T, Q).
+    sigma_acc_m: Floats
     modes: Integers  #: Number of fault modes, shape (T,).
     unmonitored: Floats  #: Probability of faults that no mode covers or that prevent a position, shape (T,).
 

@@ -119,7 +119,9 @@ MAP_BRANCH_M: Final = 6.0
 CODE_COMMON_M: Final = 10.0
 CODE_COMMON_S: Final = 120.0  #: Correlation time of the code error shared by one side of a street [s].
 CODE_COMMON_TRAVEL_M: Final = 500.0  #: Correlation length of the code error shared by one side of a street [m].
-BRANCH_FLOOR: Final = 1e-3  #: Lowest odds that codes give to a branch within `BRANCH_FLOOR_M` of the best branch.
+#: Codes do not reduce the odds of a branch below this value if the branch is within `BRANCH_FLOOR_M` of the best
+#: branch.
+BRANCH_FLOOR: Final = 1e-3
 BRANCH_FLOOR_M: Final = 30.0  #: Distance from the best branch below which `BRANCH_FLOOR` applies [m].
 #: Improbable hypotheses are dropped only after this travel [m]; before, motion does not distinguish branches.
 DECIDED_TRAVEL_M: Final = 60.0

@@ -75,7 +75,8 @@ LINE: Final = record_of({
     "tilt_m": float,  # sigma of the position displacement along the line by a horizontal ionospheric gradient [m]
     "start_m": float,  # arc lengths of the line's ends [m]; infinite for ends that close a lap
     "end_m": float,
-    "start_turn_m": float,  # length of the lap that is closed at the start or end [m]; 0 at open ends
+    # length of the lap that leads back to the start or to the end of the line [m]; 0 if no lap does
+    "start_turn_m": float,
     "end_turn_m": float,
 })  # fmt: skip
 #: One source of faults, with the sub-filter that excludes it.

@@ -80,7 +80,7 @@ class ArcAmbiguities:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class PhasePositions(NotebookTable):
-    """Positions along the line from code and phase, T epochs by M channels."""
+    """Positions along the line from codes and phases, at T epochs; arrays of channels have shape (T, M)."""
 
     #: Arc length, shape (T,); NaN without an initial position or if `noise_sigma_m` is too large.
     arc_m: Floats

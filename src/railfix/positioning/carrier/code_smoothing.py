@@ -256,7 +256,9 @@ class SmoothingState:
 
 
 def _hold(values: Floats, at: Masks, first: Floats) -> Floats:
-    """Return the value at the last marked epoch (`at`) so far, or `first` if none is marked yet, shape (T, M)."""
+    """Return for each epoch the value at the newest epoch marked by `at`, or `first` before the first marked epoch;
+    shape (T, M).
+    """
     rows = np.where(at, np.arange(1, len(values) + 1)[:, None], 0)
     rows = np.maximum.accumulate(rows, axis=0)
     return np.asarray(np.take_along_axis(np.concatenate([first[None], values]), rows, axis=0))

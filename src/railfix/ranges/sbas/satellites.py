@@ -228,7 +228,7 @@ class Growth:
 def degradation_row(
     tables: SatelliteTables, limits: SbasLimits, time: Datetimes, stop: Datetimes
 ) -> tuple[Integers, Masks]:
-    """Return the row of the newest message of type 10 at epochs, and a mask of the epochs at which it is in force."""
+    """Return for each epoch the row of the newest message of type 10, and whether this message is in force."""
     row = tables.degradation.newest(0, time)
     return row, tables.degradation.in_force(row, time, stop, limits.timeout_s("degradation"))
 

@@ -84,7 +84,7 @@ class SbasState:
 
     @property
     def span(self) -> tuple[np.datetime64, np.datetime64]:
-        """Reception of the first and the last message; NaT without messages."""
+        """Times of reception of the first and the last message, NaT if there are no messages."""
         return self.corrections.span
 
     def source(self, models: BroadcastSource) -> CorrectionSource:

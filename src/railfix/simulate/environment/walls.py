@@ -208,7 +208,7 @@ _LEAST_SIDE: Final = 0.02
 
 @dataclass(frozen=True, kw_only=True)
 class SideStreets:
-    """n side streets on one side of the line, by rising chainage."""
+    """n side streets on one side of the line, in ascending order of chainage."""
 
     start_m: Floats  #: Chainage of the near wall, shape (n,).
     end_m: Floats  #: Chainage of the far wall, shape (n,).

@@ -81,7 +81,7 @@ class Course:
 
 @dataclass(frozen=True, kw_only=True)
 class Pass:
-    """Part of a leg on the line, sampled at p positions."""
+    """Part of a leg that lies on the line; the part is sampled at p positions."""
 
     leg: int  #: Index of the leg.
     sign: int  #: 1 in the direction of the line, -1 in the opposite direction.
