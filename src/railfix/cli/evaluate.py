@@ -76,7 +76,8 @@ def show_evaluation(evaluation: Evaluation, files: dict[str, Path], *, verbose: 
         show_notes(console, run.notes)
     levels, groups = level_tables(evaluation, worst=_MOST_BEYOND), group_tables(evaluation)
     tables = [*error_tables(evaluation), *levels, *groups]
-    main = (*_MAIN_TABLES, "stanford") if evaluation.options.alarm_limits_m else _MAIN_TABLES
+    own_limits = evaluation.options.alarm_limits_m != EvaluationOptions().alarm_limits_m
+    main = (*_MAIN_TABLES, "stanford") if own_limits else _MAIN_TABLES
     shown = [table for table in tables if verbose or table.name.startswith(main)]
     for table in shown:
         if table in levels[:1]:
