@@ -63,7 +63,7 @@ _MOST_BEYOND: Final = 5  #: Maximum number of printed epochs with an error above
 def show_evaluation(evaluation: Evaluation, files: dict[str, Path], *, verbose: bool) -> None:
     """Print the verdict, the references of each run, the tables, and the paths of the written files.
 
-    Without `verbose`, only `_MAIN_TABLES` and, for alarm limits other than the default, the Stanford counts are printed.
+    Without `verbose`, only `_MAIN_TABLES` and, for alarm limits that were given, the Stanford counts are printed.
     """
     console = TableConsole()
     show_verdict(console, verdict_of_evaluation(evaluation))
