@@ -333,7 +333,7 @@ def create_track(
     if len(thinned.turns):
         notes.append(
             f"the path turns back at {plural(thinned.turns, 'point')}: where its two legs are side by side, positions "
-            "are ambiguous and the filter may follow the wrong leg; give positions of a run in one direction"
+            "are ambiguous and the filter may follow the wrong leg. Give positions of a run in one direction"
         )
     return Track.from_ecef(
         ecef_m[thinned.kept],
